@@ -3,12 +3,12 @@
 from inspection.models.events import AuditEvent, Event
 from inspection.models.people import Role, User
 from inspection.models.plant import Region, Tool, ToolType
-from inspection.models.results import Damage, Measurement, PrecisionReport, RangeImage
+from inspection.models.results import Damage, Measurement, PrecisionReport, RangeImage, Recomputation
 from inspection.models.rigs import Calibration, Limit, LimitSet, Recipe, Rig
 from inspection.models.scans import Inspection, Scan
 from inspection.models.schedules import DueSlot, Schedule
 
 __all__ = [
     "AuditEvent", "Calibration", "Damage", "DueSlot", "Event", "Inspection", "Limit", "LimitSet", "Measurement",
-    "PrecisionReport", "RangeImage", "Recipe", "Region", "Rig", "Role", "Scan", "Schedule", "Tool", "ToolType", "User",
+    "PrecisionReport", "RangeImage", "Recipe", "Recomputation", "Region", "Rig", "Role", "Scan", "Schedule", "Tool", "ToolType", "User",
 ]  # fmt: skip

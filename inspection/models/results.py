@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from django.conf import settings
 from django.db import models
 from django.urls import reverse
 
@@ -108,3 +109,33 @@ class PrecisionReport(InsertOnly):
 
     def __str__(self) -> str:
         return f"precision of range image {self.range_image_id}"
+
+
+class Recomputation(models.Model):
+    """An order to compute a scan's result again with a recipe. The row is the order; the message only rings for it."""
+
+    class State(models.TextChoices):
+        QUEUED = "queued"
+        RUNNING = "running"
+        DONE = "done"
+        FAILED = "failed"
+
+    scan = models.ForeignKey(Scan, on_delete=models.PROTECT, related_name="recomputations")
+    recipe = models.ForeignKey(Recipe, on_delete=models.PROTECT, related_name="+")
+    requested_by = models.ForeignKey(settings.AUTH_USER_MODEL, null=True, on_delete=models.PROTECT, related_name="+")
+    requested_at = models.DateTimeField()
+    state = models.CharField(max_length=8, choices=State, default=State.QUEUED)
+    attempts = models.PositiveIntegerField(default=0)
+    started_at = models.DateTimeField(null=True, blank=True)
+    finished_at = models.DateTimeField(null=True, blank=True)
+    fault = models.CharField(max_length=500, blank=True)
+    range_image = models.OneToOneField(
+        RangeImage, null=True, blank=True, on_delete=models.PROTECT, related_name="recomputation"
+    )
+
+    class Meta:
+        ordering = ["-requested_at", "-pk"]
+        indexes = [models.Index(fields=["state", "requested_at"])]  # the tick's list of what still waits
+
+    def __str__(self) -> str:
+        return f"{self.scan} again with {self.recipe}"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from django.conf import settings
 from django.db import models
 
@@ -32,6 +34,9 @@ class Schedule(models.Model):
     automatic = models.BooleanField(default=True)
     enabled = models.BooleanField(default=True)
     next_due = models.DateField()
+    first_due = models.DateField(
+        null=True, blank=True, help_text="Dates are counted from here, so that the 31st comes back after February."
+    )
     created_by = models.ForeignKey(settings.AUTH_USER_MODEL, null=True, on_delete=models.PROTECT, related_name="+")
 
     class Meta:
@@ -39,6 +44,11 @@ class Schedule(models.Model):
 
     def __str__(self) -> str:
         return f"{self.tool.code} every {self.every} {self.unit}"
+
+    def save(self, *args: Any, **kwargs: Any) -> None:
+        if self.first_due is None:
+            self.first_due = self.next_due
+        super().save(*args, **kwargs)
 
 
 class DueSlot(models.Model):
