@@ -1,0 +1,45 @@
+# Two commands do everything; each works from a bare clone with Python 3.11+ and make.
+PYTHON ?= python3
+VENV := .venv
+PY := $(VENV)/bin/python
+PORT ?= 8000
+
+.PHONY: up test lint clean help
+
+help:
+	@echo "make up          set up, start everything, scan the demo knife, stay up until Ctrl-C"
+	@echo "make up ONCE=1   the same, then stop; exit 0 only if R1, R2 and R3 were measured"
+	@echo "make test        install what the tests need and run them all"
+	@echo "make lint        ruff, mypy, import-linter"
+
+up: $(VENV)/.installed
+	@exec $(PY) manage.py up --port $(PORT) $(if $(filter-out 0,$(ONCE)),--once)
+
+test: $(VENV)/.installed-dev
+	$(PY) -m pytest $(ARGS)
+
+lint: $(VENV)/.installed-dev
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+	$(VENV)/bin/lint-imports
+	$(PY) -m mypy
+
+$(VENV)/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Edgewatch needs Python 3.11 or newer; $(PYTHON) is $$($(PYTHON) --version). Set PYTHON=/path/to/python3.11."; exit 1; }
+	@$(PYTHON) -c 'import ensurepip' || { echo "Python's venv module is incomplete; on Debian: apt-get install python3-venv"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+# uv, where it is on the PATH, installs the same hashed list in seconds instead of a minute.
+$(VENV)/.installed: requirements.txt | $(VENV)/bin/python
+	@echo "Installing (about a minute the first time) ..."
+	@if command -v uv >/dev/null; then uv pip install -q --python $(PY) --require-hashes -r requirements.txt; \
+	else $(PY) -m pip install -q --disable-pip-version-check --require-hashes -r requirements.txt; fi
+	@touch $@
+
+$(VENV)/.installed-dev: requirements-dev.txt $(VENV)/.installed
+	@if command -v uv >/dev/null; then uv pip install -q --python $(PY) --require-hashes -r requirements-dev.txt; \
+	else $(PY) -m pip install -q --disable-pip-version-check --require-hashes -r requirements-dev.txt; fi
+	@touch $@
+
+clean:
+	rm -rf $(VENV) var .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
