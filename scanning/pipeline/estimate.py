@@ -1,0 +1,95 @@
+"""What a stack did not say about itself: the level off the line, the width of the line, the exposure worth reading.
+
+Frames recorded by others often come without them. A guessed dark level of 0 would lift the whole background through
+GLT, and a guessed width would refuse the true line; so both are taken from the first frames, and the result says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanning.pipeline.grey import DARK_UNIT
+from scanning.pipeline.line import light_sum, lowest_code_above, row_maxima, row_peaks
+
+PIXELS_LOOKED_AT = 1 << 16
+FEWEST_ROWS = 8
+Image = NDArray[np.uint8] | NDArray[np.uint16]
+
+
+def half_sample_mode(values: NDArray[np.generic]) -> float:
+    """The value most samples crowd around: the densest half, of it the densest half, and so on (Robertson-Cryer).
+
+    Unlike the mean and the median it does not move when part of the samples are something else altogether.
+    """
+    ordered = np.sort(np.asarray(values, dtype=np.float64))
+    while ordered.size > 2:
+        half = (ordered.size + 1) // 2
+        spans = ordered[half - 1 :] - ordered[: ordered.size - half + 1]
+        narrowest = np.flatnonzero(spans == spans.min())
+        start = int(narrowest[narrowest.size // 2])
+        ordered = ordered[start : start + half]
+        if ordered[0] == ordered[-1]:
+            break
+    return float(ordered.mean())
+
+
+def dark_level(images: Sequence[Image], saturation: int) -> float:
+    """Grey level off the line: the most crowded level of the unsaturated pixels of these images of one exposure.
+
+    Where a lamp lights the scene this is the lit background, and subtracting it is what is wanted.
+    """
+    every = max(1, sum(image.size for image in images) // PIXELS_LOOKED_AT)
+    pixels = np.concatenate([image.ravel()[::every] for image in images])
+    pixels = pixels[pixels < saturation]
+    return half_sample_mode(pixels) if pixels.size else 0.0
+
+
+def line_width_px(
+    images: Sequence[Image], saturation: int, dark: float, k: float, floor: float, ceiling: float
+) -> float | None:
+    """Median full width at half maximum of the highest peaks, px; None when too few rows show one.
+
+    Only rows whose peak reaches a quarter of the bright ones count, so that noise in dark rows has no say.
+    """
+    heights: list[float] = []
+    widths: list[float] = []
+    level = round(dark * DARK_UNIT)
+    for image in images:
+        rows, columns = image.shape
+        highest = np.empty(rows, image.dtype)
+        row_maxima(image, highest)
+        maxima = np.maximum(np.minimum(highest.astype(np.int64), saturation) * DARK_UNIT - level, 0)
+        asked = k * light_sum(image, saturation, DARK_UNIT, level) / image.size
+        if ceiling > 0:
+            asked = min(asked, ceiling * float(maxima.mean()))
+        most = columns // 2 + 1
+        base, shape, height = np.empty((most, 2), np.int64), np.empty((most, 2)), np.empty(most, np.int64)
+        for r in range(rows):
+            lowest = lowest_code_above(max(asked, floor * float(maxima[r])), DARK_UNIT, level)
+            if min(int(highest[r]), saturation) < lowest:
+                continue
+            found = row_peaks(image[r], lowest, 0.5, saturation, DARK_UNIT, level, base, shape, height)
+            best = int(np.argmax(height[:found]))
+            heights.append(float(height[best]))
+            widths.append(float(shape[best, 1]))
+    if len(heights) < FEWEST_ROWS:
+        return None
+    tall = np.asarray(heights) >= 0.25 * np.percentile(heights, 90)
+    return float(np.median(np.asarray(widths)[tall]))
+
+
+def best_exposure(steps: Sequence[Sequence[Image]], darks: Sequence[float], saturation: int) -> int:
+    """Index of the exposure in which most rows have their maximum neither saturated nor in the lowest tenth.
+
+    Equal exposures: the one with as many rows too bright as too dark; still equal: the shortest.
+    """
+    keys: list[tuple[int, int]] = []
+    for e, dark in enumerate(darks):
+        maxima = np.concatenate([images[e].max(axis=1) for images in steps]).astype(np.float64)
+        bright = maxima >= saturation
+        dim = maxima < dark + 0.1 * (saturation - dark)
+        keys.append((int(np.count_nonzero(~bright & ~dim)), -abs(int(bright.sum()) - int(dim.sum()))))
+    return max(range(len(keys)), key=lambda e: (keys[e], -e))

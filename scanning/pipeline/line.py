@@ -1,0 +1,305 @@
+"""MSNN, maximum signal-to-noise and nearest neighbour: which peak of each row is the laser line.
+
+A machined metal surface throws reflections beside the line, often brighter than it. Taking the brightest peak of every
+row follows them in a fifth to a quarter of the rows. MSNN uses what a reflection does not share with the line: its
+width, and being where the line was in the row before.
+
+1. Peaks. A row's threshold is k times the mean of the image, but not under ``floor`` x the row's maximum; k times the
+   mean is cut at ``ceiling`` x the mean of all row maxima, because in a narrow or bright image it would rise above the
+   line itself. A peak starts where the row rises above the threshold (strictly) and ends where it falls to it, at the
+   last column, or where the gradient turns from negative to positive: at that valley pixel, which still belongs to
+   it. On flat stretches the last gradient that was not zero counts. With ``valley`` > 0 a dip that goes less deep
+   than that share of the lower of the two maxima beside it does not end the peak (speckle grains).
+   A peak has a base (first to last pixel), a height (maximum), a width (full width at half its height, interpolated;
+   where the base ends above half height, the base's edge) and a position (the middle of that width).
+2. Seed. From the bottom row, the first row whose peak passes the width check and is alone in its row: no better signal
+   to noise. If no such row exists, the row with the largest ratio between a peak that passes and the highest other one.
+3. Continuity. From the seed upwards and downwards, the candidate with the least |width change| + |column change|,
+   ties to the lower column, within gate_px (1 + rows missed), at most gate_max_px. Rows without one do not end it.
+4. ``seed = "longest"``: the literal rule loses the whole frame when the lowest lone peak is a reflection. The line
+   followed from it is therefore only taken when it passes the width check in more than half of the rows that have
+   any peak; otherwise further lone peaks, then any peaks that pass, are tried (at most 32 lines) and the line with
+   most rows passing wins. Whenever the literal line is long, both give the same.
+
+All numbers are relative to the light of the frame: twice the light gives the same line.
+"""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+
+from scanning.pipeline.centroid import centre_of_gravity
+from scanning.pipeline.grey import grey
+
+BLOCK = 64
+"""Columns looked at together: a block without a pixel above the threshold is skipped whole."""
+LINES_TRIED = 32
+TIE = 1e-9
+"""Costs closer than this (px) are equal; rounding must not decide between two equal candidates."""
+STRICT = 1.0 + 1e-12
+"""A value is above a threshold only when it is above it by more than rounding."""
+
+
+@nb.njit(cache=True, nogil=True)
+def row_maxima(image, highest):  # type: ignore[no-untyped-def]
+    """The highest code of every row."""
+    rows, columns = image.shape
+    for r in range(rows):
+        most = image[r, 0]
+        for c in range(1, columns):
+            most = max(most, image[r, c])
+        highest[r] = most
+
+
+@nb.njit(cache=True, nogil=True)
+def light_sum(image, top, scale, dark):  # type: ignore[no-untyped-def]
+    """Sum of the light of all pixels, exact."""
+    rows, columns = image.shape
+    nothing = dark // scale
+    total = np.int64(0)
+    for r in range(rows):
+        codes = np.int64(0)
+        lit = np.int64(0)
+        for c in range(columns):
+            code = min(np.int64(image[r, c]), top)
+            if code > nothing:
+                codes += code
+                lit += 1
+        total += codes * scale - lit * dark
+    return total
+
+
+@nb.njit(cache=True, nogil=True)
+def lowest_code_above(threshold, scale, dark):  # type: ignore[no-untyped-def]
+    """The smallest code whose light is above the threshold."""
+    limit = threshold * STRICT
+    code = np.int64(np.floor((limit + dark) / scale))
+    while code * scale - dark > limit:
+        code -= 1
+    while code * scale - dark <= limit:
+        code += 1
+    return code
+
+
+@nb.njit(cache=True, nogil=True)
+def half_width(row, first, last, height, top, scale, dark):  # type: ignore[no-untyped-def]
+    """(left, right) columns, px, where the peak crosses half its height; the base's edge where it does not."""
+    i = first
+    while 2 * grey(row[i], top, scale, dark) <= height:
+        i += 1
+    left = i - 0.5
+    if i > 0:
+        below = grey(row[i - 1], top, scale, dark)
+        if 2 * below <= height:
+            left = i - 1 + (0.5 * height - below) / (grey(row[i], top, scale, dark) - below)
+    j = last
+    while 2 * grey(row[j], top, scale, dark) <= height:
+        j -= 1
+    right = j + 0.5
+    if j < row.size - 1:
+        below = grey(row[j + 1], top, scale, dark)
+        if 2 * below <= height:
+            right = j + 1 - (0.5 * height - below) / (grey(row[j], top, scale, dark) - below)
+    return left, right
+
+
+@nb.njit(cache=True, nogil=True)
+def row_peaks(row, lowest, valley, top, scale, dark, base, shape, height):  # type: ignore[no-untyped-def]
+    """Find the peaks of one row, from low to high columns; return how many.
+
+    ``lowest`` is the smallest code above the threshold. Written per peak: base (first, last), shape (position, width)
+    in px, height in light.
+    """
+    columns = row.size
+    found = 0
+    c = 0
+    while c < columns:
+        if c % BLOCK == 0 and c + BLOCK <= columns:
+            most = row[c]
+            for b in range(c + 1, c + BLOCK):
+                most = max(most, row[b])
+            if most < lowest:
+                c += BLOCK
+                continue
+        if row[c] < lowest:
+            c += 1
+            continue
+        # A run of pixels above the threshold starts at c; cut it at its valleys.
+        run_start = found
+        while c < columns and row[c] >= lowest:
+            first = c
+            value = grey(row[c], top, scale, dark)
+            most_light = value
+            falling = False
+            c += 1
+            while c < columns and row[c] >= lowest:
+                following = grey(row[c], top, scale, dark)
+                if following < value:
+                    falling = True
+                elif following > value and falling:
+                    break
+                value = following
+                most_light = max(most_light, value)
+                c += 1
+            joins = False
+            if found > run_start:
+                dip = grey(row[first - 1], top, scale, dark)
+                joins = dip * STRICT >= (1.0 - valley) * min(height[found - 1], most_light)
+            if joins:
+                base[found - 1, 1] = c - 1
+                height[found - 1] = max(height[found - 1], most_light)
+            else:
+                base[found, 0] = first
+                base[found, 1] = c - 1
+                height[found] = most_light
+                found += 1
+    for k in range(found):
+        left, right = half_width(row, base[k, 0], base[k, 1], height[k], top, scale, dark)
+        shape[k, 0] = 0.5 * (left + right)
+        shape[k, 1] = right - left
+    return found
+
+
+@nb.njit(cache=True, nogil=True)
+def follow(counts, shape, seed_row, seed_peak, gate_px, gate_max_px, chosen):  # type: ignore[no-untyped-def]
+    """Follow the line from its seed both ways; write the chosen peak of every row, -1 where there is none."""
+    rows = counts.size
+    chosen[:] = -1
+    chosen[seed_row] = seed_peak
+    for direction in (-1, 1):
+        column = shape[seed_row, seed_peak, 0]
+        width = shape[seed_row, seed_peak, 1]
+        missed = 0
+        r = seed_row + direction
+        while 0 <= r < rows:
+            gate = min(gate_px * (1 + missed), gate_max_px) + TIE
+            best = -1
+            least = np.inf
+            for k in range(counts[r]):
+                moved = abs(shape[r, k, 0] - column)
+                if moved <= gate:
+                    cost = moved + abs(shape[r, k, 1] - width)
+                    if cost < least - TIE:
+                        least = cost
+                        best = k
+            chosen[r] = best
+            if best >= 0:
+                column = shape[r, best, 0]
+                width = shape[r, best, 1]
+                missed = 0
+            else:
+                missed += 1
+            r += direction
+
+
+@nb.njit(cache=True, nogil=True)
+def best_ratio_seed(counts, shape, height, narrowest, widest):  # type: ignore[no-untyped-def]
+    """(row, peak) whose height stands most above the highest other peak of its row; (-1, -1) when none passes."""
+    seed_row, seed_peak, best = -1, -1, 0.0
+    for r in range(counts.size - 1, -1, -1):
+        for k in range(counts[r]):
+            if narrowest <= shape[r, k, 1] <= widest:
+                other = np.int64(0)
+                for j in range(counts[r]):
+                    if j != k:
+                        other = max(other, height[r, j])
+                ratio = height[r, k] / other if other > 0 else np.inf
+                if ratio > best * STRICT:
+                    seed_row, seed_peak, best = r, k, ratio
+    return seed_row, seed_peak
+
+
+@nb.njit(cache=True, nogil=True)
+def find_line(counts, shape, height, narrowest, widest, gate_px, gate_max_px, longest, chosen):  # type: ignore[no-untyped-def]
+    """Choose the peak of every row that is the laser line; all -1 when no peak passes the width check."""
+    rows = counts.size
+    chosen[:] = -1
+    rows_with_peaks = 0
+    for r in range(rows):
+        if counts[r] > 0:
+            rows_with_peaks += 1
+    tried = 0
+    most_passing = 0
+    visited = np.zeros(height.shape, np.bool_) if longest else np.zeros((1, 1), np.bool_)
+    line = np.empty(rows, chosen.dtype)
+    for alone in (True, False):
+        if not alone and tried == 0:
+            # No row with a lone peak: the best ratio is the literal seed, and the first to be tried.
+            r, k = best_ratio_seed(counts, shape, height, narrowest, widest)
+            if r < 0:
+                return
+            follow(counts, shape, r, k, gate_px, gate_max_px, chosen)
+            if not longest:
+                return
+            tried = 1
+            for q in range(rows):
+                if chosen[q] >= 0:
+                    visited[q, chosen[q]] = True
+                    if narrowest <= shape[q, chosen[q], 1] <= widest:
+                        most_passing += 1
+            if 2 * most_passing > rows_with_peaks:
+                return
+        for r in range(rows - 1, -1, -1):
+            if alone and counts[r] != 1:
+                continue
+            for k in range(counts[r]):
+                if not narrowest <= shape[r, k, 1] <= widest:
+                    continue
+                if not longest:
+                    follow(counts, shape, r, k, gate_px, gate_max_px, chosen)
+                    return
+                if visited[r, k]:
+                    continue
+                follow(counts, shape, r, k, gate_px, gate_max_px, line)
+                passing = 0
+                for q in range(rows):
+                    if line[q] >= 0:
+                        visited[q, line[q]] = True
+                        if narrowest <= shape[q, line[q], 1] <= widest:
+                            passing += 1
+                if passing > most_passing:
+                    most_passing = passing
+                    chosen[:] = line
+                tried += 1
+                if 2 * most_passing > rows_with_peaks or tried >= LINES_TRIED:
+                    return
+
+
+@nb.njit(cache=True, nogil=True)
+def extract_line(  # type: ignore[no-untyped-def]
+    image, top, scale, dark, k, floor, ceiling, valley, narrowest, widest, gate_px, gate_max_px, longest,
+    highest, base, shape, height, counts, chosen, column_px, peak, width_px,
+):  # fmt: skip
+    """MSNN then COG on one (rows, columns) image of integer codes (see `grey.grey` for top, scale, dark).
+
+    Writes, per row, column_px (px from 0, NaN undefined), peak (light of the line's maximum) and width_px (full width
+    at half maximum, px). ``highest, base, shape, height, counts, chosen`` are scratch that keeps its size.
+    """
+    rows, columns = image.shape
+    row_maxima(image, highest)
+    mean = light_sum(image, top, scale, dark) / (rows * columns)
+    asked = k * mean
+    if ceiling > 0.0:
+        of_maxima = np.int64(0)
+        for r in range(rows):
+            of_maxima += grey(highest[r], top, scale, dark)
+        asked = min(asked, ceiling * (of_maxima / rows))
+    for r in range(rows):
+        threshold = max(asked, floor * grey(highest[r], top, scale, dark))
+        lowest = lowest_code_above(threshold, scale, dark)
+        counts[r] = 0
+        if min(np.int64(highest[r]), top) >= lowest:
+            counts[r] = row_peaks(image[r], lowest, valley, top, scale, dark, base[r], shape[r], height[r])
+    find_line(counts, shape, height, narrowest, widest, gate_px, gate_max_px, longest, chosen)
+    for r in range(rows):
+        peak_of_row = chosen[r]
+        if peak_of_row < 0:
+            column_px[r] = np.nan
+            peak[r] = np.nan
+            width_px[r] = np.nan
+        else:
+            first, last = base[r, peak_of_row, 0], base[r, peak_of_row, 1]
+            column_px[r] = centre_of_gravity(image[r], first, last, top, scale, dark)
+            peak[r] = height[r, peak_of_row]
+            width_px[r] = shape[r, peak_of_row, 1]
