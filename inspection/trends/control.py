@@ -29,7 +29,7 @@ class Individuals:
 
 
 def individuals(values: Sequence[float], breaks: Sequence[int] = ()) -> Individuals | None:
-    """Return the I-MR chart of ``values`` (NIST 6.3.2.2: mean +- 3 MRbar / 1.128), None with fewer than two ranges' data.
+    """Return the I-MR chart of ``values`` (NIST 6.3.2.2: mean +- 3 MRbar / 1.128); None without a range.
 
     ``breaks`` are indices before which something happened (an event, missing scans): no moving range spans them.
     """
