@@ -88,7 +88,9 @@ class ImagingSystem:
         # carry 1/pixel. A wider pupil would fold over and draw speckle that no lens makes.
         if not self.wavelength_um * system.working_f_number >= self.pixel_um:
             least = self.pixel_um / self.wavelength_um / (1.0 + self.magnification)
-            raise BadInput(f"f/{f_number:g} is wider than {self.name} can be simulated with; use f/{least:.1f} or more.")
+            raise BadInput(
+                f"f/{f_number:g} is wider than {self.name} can be simulated with; use f/{least:.1f} or more."
+            )
         return system
 
 

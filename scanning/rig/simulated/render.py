@@ -17,6 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from scanning.errors import BadInput
+from scanning.rig.protocols import Image
 from scanning.rig.simulated.geometry import WORKING_HEIGHT_UM
 from scanning.rig.simulated.randomness import grain_field
 from scanning.rig.simulated.scenes import Scene
@@ -108,7 +109,7 @@ class Renderer:
         first = int(np.ceil((position_um - reach - shift) / GRAIN_UM))
         last = int(np.floor((position_um + reach - shift) / GRAIN_UM))
         lines = [self._line(k) for k in range(first, last + 1)]
-        x_um = np.arange(first, last + 1) * GRAIN_UM + shift - position_um
+        x_um = np.asarray(np.arange(first, last + 1) * GRAIN_UM + (shift - position_um), dtype=np.float64)
         heights = np.stack([height for _, height in lines])
         if scene.pose.thermal_um_per_mm:
             heights += np.float32(scene.pose.thermal_um_per_mm * position_um * 1e-3)
@@ -127,7 +128,7 @@ class Renderer:
                 reflection.add(frame, self._tile, position_um, scene.level_e_per_us)
         return frame
 
-    def expose(self, irradiance: Float32, exposure_us: float, rng: np.random.Generator) -> NDArray[np.uint8 | np.uint16]:
+    def expose(self, irradiance: Float32, exposure_us: float, rng: np.random.Generator) -> Image:
         """Return the camera's image of ``irradiance``; same as ``self.sensor.expose``."""
         return self.sensor.expose(irradiance, exposure_us, rng)
 

@@ -151,7 +151,7 @@ class Scene:
         pose = self.pose
         for first in range(0, steps, 64):
             part = slice(first, min(first + 64, steps))
-            s = (np.arange(part.start, part.stop) * step_um)[None, :]
+            s = (np.arange(part.start, part.stop, dtype=np.float64) * step_um)[None, :]
             z = self.height_um(s, y)
             own = (s - pose.shift_along_um, y - pose.shift_across_um)
             height[:, part] = z

@@ -148,7 +148,9 @@ class CoherentCamera:
     ``defocus_um`` is the distance of the surface from best focus along the axis; it adds a quadratic phase over the pupil.
     """
 
-    def __init__(self, system: ImagingSystem, *, rows: int, columns: int, grain_um: float, defocus_um: float = 0.0) -> None:
+    def __init__(
+        self, system: ImagingSystem, *, rows: int, columns: int, grain_um: float, defocus_um: float = 0.0
+    ) -> None:
         self._system = system
         self._rows = rows
         self._columns = columns
@@ -226,7 +228,13 @@ class CoherentCamera:
         half = self._weights.size // 2
         skip = (half + 1) // SAMPLES_PER_PIXEL
         _to_pixels(
-            field[SAMPLES_PER_PIXEL * skip - half :], self._weights, GUARD, level * gain, self._rows, first + skip, frame
+            field[SAMPLES_PER_PIXEL * skip - half :],
+            self._weights,
+            GUARD,
+            level * gain,
+            self._rows,
+            first + skip,
+            frame,
         )
         return max(first, 0), min(last, self._columns)
 
