@@ -20,6 +20,7 @@ from django.utils import timezone
 from inspection.models import Event, Limit, LimitSet, Measurement, RangeImage, Region, Tool
 from inspection.states import ScanState
 from inspection.trends.forecast import Reading, SegmentFit, fit_segment, forecast_sentence, segment_of
+from inspection.units import unit_sign
 
 #: Points of the drawn line and its band.
 LINE_POINTS = 24
@@ -204,7 +205,7 @@ def _forecast(
     if limit is None or bound is None:
         return None, f"No limit is set for {label}, so there is nothing to forecast."
     if unit != limit.unit:
-        return None, f"The limit of {label} is in {limit.unit} but it is measured in {unit}, so they are not compared."
+        return None, f"The limit of {label} is in {unit_sign(limit.unit)} but it is measured in {unit_sign(unit)}, so they are not compared."
     place: float | None = None
     if fit is not None:
         place = fit.position(now) if fit.axis == "date" else max(tool.life_used, fit.wear.last_life)

@@ -10,6 +10,7 @@ import datetime as dt
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from inspection.units import unit_sign
 from inspection.trends.wear import POINTS_FOR_RATE, TimeToLimit, WearFit, fit_wear
 
 DAY_S = 86400.0
@@ -103,6 +104,7 @@ def forecast_sentence(
     ``now`` is the tool's present place on the fit's axis. Returns the sentence and the numbers behind it (None where
     there is nothing to forecast).
     """
+    unit = unit_sign(unit)
     target = f"the {limit_name} limit of {number(limit)} {unit}"
     if latest_value is not None and latest_value > limit:
         return f"{label} is {number(latest_value)} {unit}: {target} is already passed.", None

@@ -19,9 +19,9 @@ from inspection.states import ScanState, Verdict
 UTC = dt.UTC
 FIRST_VISIT = dt.datetime(2026, 6, 1, 6, 30, tzinfo=UTC)
 METRICS = [
-    ("edge_recession_mean", "Mean edge recession", "µm"),
-    ("missing_volume", "Missing volume", "mm³"),
-    ("depth_max", "Greatest depth", "µm"),
+    ("ER_max", "Greatest edge recession", "um"),
+    ("V-", "Missing volume", "mm3"),
+    ("d_max", "Greatest depth", "um"),
 ]
 
 
@@ -38,9 +38,9 @@ def knife(code: str = "K-114", note: str = "") -> Tool:
     if made:
         limits = LimitSet.objects.create(tool_type=tool_type, version=1, reason="First limits", by=person("erik"))
         for metric, watch, replace, unit in [
-            ("edge_recession_mean", 300.0, 450.0, "µm"),
-            ("missing_volume", 0.02, 0.05, "mm³"),
-            ("depth_max", 100.0, 150.0, "µm"),
+            ("ER_max", 300.0, 450.0, "um"),
+            ("V-", 0.02, 0.05, "mm3"),
+            ("d_max", 100.0, 150.0, "um"),
         ]:
             Limit.objects.create(limit_set=limits, metric=metric, watch_above=watch, replace_above=replace, unit=unit)
     tool = Tool.objects.create(code=code, tool_type=tool_type, location="Chipper 2, pocket 5", note=note, life_used=48)
@@ -198,18 +198,18 @@ def result(
         verdict_reasons=reasons,
     )
     measured: dict[str, Any] = {
-        "edge_recession_mean": (recession + 4.0 * i, 3.1),
-        "missing_volume": ([0.0008, 0.031, 0.142][i], [0.0009, 0.0016, 0.0041][i]),
-        "depth_max": ([9.0, 92.0, 214.0][i], [2.4, 3.2, 4.4][i]),
+        "ER_max": (recession + 4.0 * i, 3.1),
+        "V-": ([0.0008, 0.031, 0.142][i], [0.0009, 0.0016, 0.0041][i]),
+        "d_max": ([9.0, 92.0, 214.0][i], [2.4, 3.2, 4.4][i]),
     }
     for metric, label, unit in METRICS:
         value, u = measured[metric]
         Measurement.objects.create(
             range_image=image, metric=metric, label=label, value=values.get(metric, value), unit=unit, u=u,
-            origin="signed sum of the residual inside the dilated mask" if "volume" in metric else "robust plane",
+            origin="signed sum of the residual inside the dilated mask" if metric == "V-" else "robust plane",
         )  # fmt: skip
     Measurement.objects.create(
-        range_image=image, metric="sq_corrected", label="Sq without noise", value=None, unit="µm", u=None,
+        range_image=image, metric="Sq_c", label="Sq without noise", value=None, unit="um", u=None,
         origin="not resolvable: Sq is below 1.5 times the noise",
     )  # fmt: skip
     for number, (row, profile, radius, depth) in enumerate(chips, 1):
@@ -219,7 +219,8 @@ def result(
             severity="large" if depth > 150 else "medium" if depth > 50 else "minor",
             volume_mm3=depth * radius**2 * 4.4e-7, u_volume_mm3=0.0012, depth_um=depth, u_depth_um=3.4,
             area_mm2=radius**2 * 2.4e-4, length_mm=radius * 0.017, start_mm=start, end_mm=start + radius * 0.017,
-            touches_edge=row > 850, detail={"box": [row - radius, profile - radius / 5, row + radius, profile + radius / 5]},
+            touches_edge=row > 850, detail={"rows": [row - 2 * radius, row + 2 * radius],
+                    "profiles": [profile - 1.7 * radius, profile + 1.7 * radius]},
         )  # fmt: skip
     PrecisionReport.objects.create(
         range_image=image, undefined_count=15300, undefined_share=0.0635, saturated_count=120, saturated_share=2.1e-6,
