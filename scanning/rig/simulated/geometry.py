@@ -9,7 +9,8 @@ principal distance C = M S sees a point (x, z) at
 
     d = M u / (1 - a / S),   u = x sin b + z cos b,   a = z sin b - x cos b
 
-which for x = 0 is eq. (1) of the paper with its reference on the axis, and for small d its eq. (2), dz = dd / (M cos b).
+which for x = 0 is eq. (1) of the paper with its reference on the axis, and for small d its eq. (2),
+dz = dd / (M cos b).
 Rows are taken as telecentric: over 0.3 mm of height the row magnification would change by 0.16 %.
 """
 

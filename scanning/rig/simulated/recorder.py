@@ -68,10 +68,10 @@ def record(
     """Record ``steps`` scan images per exposure of a scene into ``out_folder`` and return the folder.
 
     245 steps give the paper's 241 profiles with a sliding window, 1205 with blocks of five. ``scene_options`` go to
-    `scenes.scene` (f_number, system, wear_um, visit, stray, decades, tilts, damages ...). The folder gets ``stack.json``,
-    one multi-page TIFF per exposure, ``truth.npz`` (`Truth.save`) and ``scene.json`` (every parameter). ``noise_seed`` is
-    the draw of the sensor noise: another one repeats the scan without moving the part. Raises BadInput when the folder
-    already holds something or a number makes no sense.
+    `scenes.scene` (f_number, system, wear_um, visit, stray, decades, tilts, damages ...). The folder gets
+    ``stack.json``, one multi-page TIFF per exposure, ``truth.npz`` (`Truth.save`) and ``scene.json`` (every parameter).
+    ``noise_seed`` is the draw of the sensor noise: another one repeats the scan without moving the part. Raises
+    BadInput when the folder already holds something or a number makes no sense.
     """
     if isinstance(scene_name, Scene):
         if scene_options:

@@ -46,8 +46,8 @@ LEVEL_E_PER_US = 7.0
 class Pose:
     """How the part lies: mounting height over the rig's datum, tilts, and shifts from its nominal place.
 
-    ``thermal_um_per_mm`` is the drift of the stand-off while the scan goes on, an error of the rig and so no part of the
-    truth.
+    ``thermal_um_per_mm`` is the drift of the stand-off while the scan goes on, an error of the rig and so no part of
+    the truth.
     """
 
     height_um: float = WORKING_HEIGHT_UM
@@ -105,7 +105,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Scene:
-    """One region of a part on the rig; coordinates of the rig: s along the scan, y = 0 at the as-new edge's nominal row."""
+    """One region of a part on the rig, in coordinates of the rig: s along the scan, y = 0 where an as-new edge lies."""
 
     name: str
     seed: int
@@ -371,11 +371,11 @@ def scene(
 ) -> Scene:
     """Return the scene ``name`` (R1 sharp edge, R2 two medium and one minor damage, R3 one large, gauge, flat).
 
-    ``seed`` is the individual part: its texture, stains and speckle. ``wear_um`` mean edge recession. ``visit`` lays the
-    part on the rig anew (0: exactly as asked). ``decades`` scales the spread of reflectivity (0 uniform; 1 for the knife,
-    0 for the plate, 1 for the gauge). ``stray`` reflections: none, moderate (the knife's default) or hard. Tilts in degrees
-    (knife 0.4 across, 0.1 along; others 0). ``texture_um`` Sq of the grinding marks (0.35 on the knife). ``damages``
-    replaces the scene's own. Raises BadInput for anything unknown.
+    ``seed`` is the individual part: its texture, stains and speckle. ``wear_um`` mean edge recession. ``visit`` lays
+    the part on the rig anew (0: exactly as asked). ``decades`` scales the spread of reflectivity (0 uniform; 1 for the
+    knife and the gauge, 0 for the plate). ``stray`` reflections: none, moderate (the knife's default) or hard. Tilts in
+    degrees (knife 0.4 across, 0.1 along; others 0). ``texture_um`` Sq of the grinding marks (0.35 on the knife).
+    ``damages`` replaces the scene's own. Raises BadInput for anything unknown.
     """
     if name not in SCENES:
         raise BadInput(f"There is no scene {name!r}; choose one of {', '.join(SCENES)}.")

@@ -159,10 +159,10 @@ class LinearSensor:
 
 @dataclass(frozen=True)
 class LogarithmicSensor:
-    """Photovoltaic pixels in open circuit: the grey value follows the logarithm of light over 120 dB, without exposure time.
+    """Photovoltaic pixels in open circuit: the grey value follows the logarithm of light, without exposure time.
 
-    ``floor_e_per_us`` is the rate at which the response bends away from zero; 20 log10(brightest / floor) = ``range_db``
-    fills the codes. Noise of such pixels is constant in the logarithm.
+    ``floor_e_per_us`` is the rate at which the response bends away from zero; the brightest light, ``range_db`` above
+    it (20 log10), fills the codes. Noise of such pixels is constant in the logarithm.
     """
 
     bits: int = 8

@@ -55,8 +55,8 @@ def _spreading_response(frequency: Float64) -> Float64:
 def _pixel_weights() -> Float32:
     """Return the 7 weights that integrate two samples per pixel over one pixel, centred on it.
 
-    The pixel's response sinc(f) is expanded in cosines of half pixels and the expansion cut with a cosine taper; for the
-    frequencies behind an f/5.6 pupil it is right within 1 %.
+    The pixel's response sinc(f) is expanded in cosines of half pixels and the expansion cut with a cosine taper; for
+    the frequencies behind an f/5.6 pupil it is right within 1 %.
     """
     f = (np.arange(4000) + 0.5) / 4000
     weights = np.array([np.mean(np.sinc(f) * np.cos(np.pi * n * f)) for n in range(4)])
@@ -66,7 +66,7 @@ def _pixel_weights() -> Float32:
 
 
 def _disc(rows: int, columns: int, cutoff: float) -> Float32:
-    """Return the share of each frequency cell that lies inside the pupil, (columns, rows); cutoff in cycles per sample."""
+    """Return the share of each frequency cell inside the pupil, (columns, rows); cutoff in cycles per sample."""
     sub = (np.arange(8) - 3.5) / 8
     f_row = scipy.fft.fftfreq(rows)
     f_column = scipy.fft.fftfreq(columns)
@@ -145,7 +145,7 @@ def _to_pixels(
 class CoherentCamera:
     """Images grains through the lens pupil onto ``rows`` x ``columns`` pixels; holds no state but tables.
 
-    ``defocus_um`` is the distance of the surface from best focus along the axis; it adds a quadratic phase over the pupil.
+    ``defocus_um`` is the distance of the surface from best focus along the axis: a quadratic phase over the pupil.
     """
 
     def __init__(
@@ -189,9 +189,9 @@ class CoherentCamera:
     ) -> tuple[int, int]:
         """Add the image of the lit grains to ``frame``; return the columns (first, behind last) that were touched.
 
-        ``grains`` and ``heights_um`` (from the working height, NaN where nothing is) are (lines, grain_rows), one line of
-        grains per entry of ``x_um`` and ``amplitude``. A plain surface under an even light of amplitude 1 comes out as
-        ``level``.
+        ``grains`` and ``heights_um`` (from the working height, NaN where nothing is) are (lines, grain_rows), one line
+        of grains per entry of ``x_um`` and ``amplitude``. A plain surface under an even light of amplitude 1 comes out
+        as ``level``.
         """
         if not np.isfinite(heights_um).any():
             return 0, 0

@@ -1,9 +1,9 @@
 """Light that is not the line: second lines, bright spots and arcs, as shiny fixtures and nozzles send them.
 
 An extractor that is never shown a brighter blob than its line looks perfect until it meets a nozzle. These
-reflections have their own geometry: they do not obey the triangulation, they move with the stage in their own way or not
-at all, and some are brighter than the line. They carry speckle like all laser light, from a frozen speckle tile that
-slides along with them; they add to the line as intensity, not coherently.
+reflections have their own geometry: they do not obey the triangulation, they move with the stage in their own way or
+not at all, and some are brighter than the line. They carry speckle like all laser light, from a frozen speckle tile
+that slides along with them; they add to the line as intensity, not coherently.
 
 Places are given in the frame: ``row`` as a share of the frame's height, ``offset_px`` in columns from the middle of the
 frame, ``drift_px_per_mm`` in columns per millimetre of stage travel. Strengths are relative to the peak of the line on
@@ -34,7 +34,7 @@ def _textured(tile: Float32, row: int, column: int, shift_px: float) -> float:
     """Speckle at a pixel, the tile moved by ``shift_px`` columns."""
     n = tile.shape[0]
     u = column - shift_px
-    j = int(math.floor(u))
+    j = math.floor(u)
     f = u - j
     r = row % n
     return float((1.0 - f) * tile[r, j % n] + f * tile[r, (j + 1) % n])

@@ -143,9 +143,9 @@ class Shape(Protocol):
 class Bevel:
     """A ground bevel that ends in a sharp edge at y = 0.
 
-    ``wear_um`` is the mean recession of the edge; it varies by some 12 % along the edge, and the bevel rolls off towards
-    the worn edge over twice the recession. ``texture_um`` is the Sq of the grinding marks (a ground bevel: < 1 um),
-    which run at ``lay_deg`` to the edge.
+    ``wear_um`` is the mean recession of the edge; it varies by some 12 % along the edge, and the bevel rolls off
+    towards the worn edge over twice the recession. ``texture_um`` is the Sq of the grinding marks (a ground bevel:
+    < 1 um), which run at ``lay_deg`` to the edge.
     """
 
     seed: int
