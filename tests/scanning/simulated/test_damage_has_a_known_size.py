@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -65,32 +66,26 @@ def test_the_regions_carry_the_papers_damages(name: str, severities: list[str]) 
 
 
 def test_wear_moves_the_edge_back_by_its_mean_and_never_forward() -> None:
-    rows = []
+    edges = []
     for wear in (0.0, 50.0, 150.0, 400.0):
         truth = scene("R1", seed=3, wear_um=wear).truth(rows=200, steps=1205)
-        rows.append((~truth.visible).sum(axis=0).mean() * truth.row_pitch_um)
-    back = np.diff(np.array(rows))
-    assert back == pytest.approx([50.0, 100.0, 250.0], rel=0.1)
+        edges.append((~truth.visible).sum(axis=0) * truth.row_pitch_um)
+    for wear, edge in zip((50.0, 150.0, 400.0), edges[1:], strict=True):
+        # A row is gone as soon as its middle is, which counts half a row too many on average.
+        back = edge - edges[0] - truth.row_pitch_um / 2
+        assert back.mean() == pytest.approx(wear, rel=0.06)
+        assert back.min() > 0.25 * wear
 
 
 @pytest.mark.parametrize(
     ("wrong", "sentence"),
     [
-        (
-            {"kind": "chip", "s_um": 0, "length_um": 100, "reach_um": 50, "depth_um": 60},
-            "steeper than the camera can see",
-        ),
-        (
-            {"kind": "dent", "s_um": 0, "length_um": 400, "reach_um": 200, "depth_um": 60, "y_um": 100},
-            "reaches over the edge",
-        ),
-        (
-            {"kind": "chip", "s_um": 0, "length_um": 400, "reach_um": 200, "depth_um": 60, "y_um": 10},
-            "lies on the edge",
-        ),
-        ({"kind": "dent", "s_um": 0, "length_um": 400, "reach_um": -1, "depth_um": 60, "y_um": 300}, "positive"),
+        (("chip", 0, 100, 50, 60), "steeper than the camera can see"),
+        (("dent", 0, 400, 200, 60, 100), "reaches over the edge"),
+        (("chip", 0, 400, 200, 60, 10), "lies on the edge"),
+        (("dent", 0, 400, -1, 60, 300), "positive"),
     ],
 )
-def test_damage_that_cannot_be_is_refused_in_one_sentence(wrong: dict[str, float], sentence: str) -> None:
+def test_damage_that_cannot_be_is_refused_in_one_sentence(wrong: tuple[Any, ...], sentence: str) -> None:
     with pytest.raises(BadInput, match=sentence):
-        Damage(**wrong)  # type: ignore[arg-type]
+        Damage(*wrong)
