@@ -90,20 +90,23 @@ class Line:
     """MSNN: which peak of each row is the laser line. ``scanning/pipeline/line.py`` explains every parameter.
 
     ``k``: threshold as a multiple of the mean of the image; None means 3, or 1.5 on compressed grey (after GLT, or
-    from a logarithmic camera). ``floor``: the threshold is never under this share of the row's maximum.
+    from a logarithmic camera). ``floor``: the threshold is never under this share of the row's maximum; None means
+    0.1, after GLT what 0.05 of the light became (0.59 at p = 0.5), 0.6 from a logarithmic camera.
     ``ceiling``: the image mean asks for no more than this share of the mean row maximum (0: no ceiling).
-    ``valley``: a dip ends a peak only when it goes deeper than this share of the lower of the maxima beside it
-    (0: every dip ends it). ``width_px``: line width in px, None takes the header's, or estimates it. ``width_factor``:
-    a peak passes the width check between width/factor and width*factor. ``gate_px``, ``gate_max_px``: how far the line
-    may move from row to row: gate_px (1 + rows missed), at most gate_max_px. ``seed``: ``first`` follows the line
-    from the first good row from the bottom; ``longest`` tries the others too when that line turns out short.
+    ``grain_px``: peaks this many pixels or less apart are grains of one line (0: never), as long as together they are
+    no wider than ``grain_span`` x the line's width. ``width_px``: line width in px, None takes the header's, or
+    estimates it. ``width_factor``: a peak passes the width check between width/factor and width*factor. ``gate_px``,
+    ``gate_max_px``: how far the line may move from row to row: gate_px (1 + rows missed), at most gate_max_px.
+    ``seed``: ``first`` follows the line from the first good row from the bottom; ``longest`` tries the others too when
+    that line turns out short. The paper to the letter is floor 0.1, ceiling 0, grain_px 0, seed first.
     """
 
     key: ClassVar[str] = "msnn"
     k: float | None = None
-    floor: float = 0.1
+    floor: float | None = None
     ceiling: float = 0.5
-    valley: float = 0.0
+    grain_px: float = 3.0
+    grain_span: float = 3.0
     width_px: float | None = None
     width_factor: float = 2.0
     gate_px: float = 12.0
@@ -113,9 +116,11 @@ class Line:
     def __post_init__(self) -> None:
         if self.k is not None:
             _number("msnn.k", self.k, 0.0, 1000.0, above=True)
-        _number("msnn.floor", self.floor, 0.0, 0.99)
+        if self.floor is not None:
+            _number("msnn.floor", self.floor, 0.0, 0.99)
         _number("msnn.ceiling", self.ceiling, 0.0, 1.0)
-        _number("msnn.valley", self.valley, 0.0, 1.0)
+        _number("msnn.grain_px", self.grain_px, 0.0, 1e5)
+        _number("msnn.grain_span", self.grain_span, 0.0, 1e5)
         if self.width_px is not None:
             _number("msnn.width_px", self.width_px, 0.0, 1e5, above=True)
         _number("msnn.width_factor", self.width_factor, 1.0, 1e6)
@@ -369,7 +374,8 @@ def _read_text(_name: str, text: str) -> str:
 
 _READERS: dict[str, Callable[[str, str], Any]] = {
     "mode": _read_text, "window": _read_int, "saturated": _read_text, "p": _read_float,
-    "k": _read_float_or_default, "floor": _read_float, "ceiling": _read_float, "valley": _read_float,
+    "k": _read_float_or_default, "floor": _read_float_or_default, "ceiling": _read_float, "grain_px": _read_float,
+    "grain_span": _read_float,
     "width_px": _read_float_or_default, "width_factor": _read_float, "gate_px": _read_float,
     "gate_max_px": _read_float, "seed": _read_text,
 }  # fmt: skip

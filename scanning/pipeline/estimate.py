@@ -16,6 +16,7 @@ from scanning.pipeline.line import light_sum, lowest_code_above, row_maxima, row
 
 PIXELS_LOOKED_AT = 1 << 16
 FEWEST_ROWS = 8
+GRAIN_PX = 3.0
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 
@@ -71,7 +72,7 @@ def line_width_px(
             lowest = lowest_code_above(max(asked, floor * float(maxima[r])), DARK_UNIT, level)
             if min(int(highest[r]), saturation) < lowest:
                 continue
-            found = row_peaks(image[r], lowest, 0.5, saturation, DARK_UNIT, level, base, shape, height)
+            found = row_peaks(image[r], lowest, GRAIN_PX, np.inf, saturation, DARK_UNIT, level, base, shape, height)
             best = int(np.argmax(height[:found]))
             heights.append(float(height[best]))
             widths.append(float(shape[best, 1]))

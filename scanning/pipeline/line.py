@@ -8,8 +8,10 @@ width, and being where the line was in the row before.
    mean is cut at ``ceiling`` x the mean of all row maxima, because in a narrow or bright image it would rise above the
    line itself. A peak starts where the row rises above the threshold (strictly) and ends where it falls to it, at the
    last column, or where the gradient turns from negative to positive: at that valley pixel, which still belongs to
-   it. On flat stretches the last gradient that was not zero counts. With ``valley`` > 0 a dip that goes less deep
-   than that share of the lower of the two maxima beside it does not end the peak (speckle grains).
+   it. On flat stretches the last gradient that was not zero counts. Coherent light makes grains of the line, so taken
+   literally a "peak" is often one grain of it: neighbouring peaks no more than ``grain_px`` pixels apart are one, as
+   long as their common base is no wider than ``grain_span`` x the line. Measured on coherent speckle (f/5.6, 160
+   columns, one exposure): sigma 15.6 um and response slope 0.73-0.89 literally, 8.1 um and 0.99-1.00 joined.
    A peak has a base (first to last pixel), a height (maximum), a width (full width at half its height, interpolated;
    where the base ends above half height, the base's edge) and a position (the middle of that width).
 2. Seed. From the bottom row, the first row whose peak passes the width check and is alone in its row: no better signal
@@ -105,7 +107,7 @@ def half_width(row, first, last, height, top, scale, dark):  # type: ignore[no-u
 
 
 @nb.njit(cache=True, nogil=True)
-def row_peaks(row, lowest, valley, top, scale, dark, base, shape, height):  # type: ignore[no-untyped-def]
+def row_peaks(row, lowest, grain_px, span_px, top, scale, dark, base, shape, height):  # type: ignore[no-untyped-def]
     """Find the peaks of one row, from low to high columns; return how many.
 
     ``lowest`` is the smallest code above the threshold. Written per peak: base (first, last), shape (position, width)
@@ -126,7 +128,6 @@ def row_peaks(row, lowest, valley, top, scale, dark, base, shape, height):  # ty
             c += 1
             continue
         # A run of pixels above the threshold starts at c; cut it at its valleys.
-        run_start = found
         while c < columns and row[c] >= lowest:
             first = c
             value = grey(row[c], top, scale, dark)
@@ -143,9 +144,9 @@ def row_peaks(row, lowest, valley, top, scale, dark, base, shape, height):  # ty
                 most_light = max(most_light, value)
                 c += 1
             joins = False
-            if found > run_start:
-                dip = grey(row[first - 1], top, scale, dark)
-                joins = dip * STRICT >= (1.0 - valley) * min(height[found - 1], most_light)
+            if found > 0 and grain_px > 0.0:
+                apart = first - base[found - 1, 1] - 1
+                joins = apart <= grain_px and c - base[found - 1, 0] <= span_px
             if joins:
                 base[found - 1, 1] = c - 1
                 height[found - 1] = max(height[found - 1], most_light)
@@ -268,7 +269,7 @@ def find_line(counts, shape, height, narrowest, widest, gate_px, gate_max_px, lo
 
 @nb.njit(cache=True, nogil=True)
 def extract_line(  # type: ignore[no-untyped-def]
-    image, top, scale, dark, k, floor, ceiling, valley, narrowest, widest, gate_px, gate_max_px, longest,
+    image, top, scale, dark, k, floor, ceiling, grain_px, span_px, narrowest, widest, gate_px, gate_max_px, longest,
     highest, base, shape, height, counts, chosen, column_px, peak, width_px,
 ):  # fmt: skip
     """MSNN then COG on one (rows, columns) image of integer codes (see `grey.grey` for top, scale, dark).
@@ -290,7 +291,9 @@ def extract_line(  # type: ignore[no-untyped-def]
         lowest = lowest_code_above(threshold, scale, dark)
         counts[r] = 0
         if min(np.int64(highest[r]), top) >= lowest:
-            counts[r] = row_peaks(image[r], lowest, valley, top, scale, dark, base[r], shape[r], height[r])
+            counts[r] = row_peaks(
+                image[r], lowest, grain_px, span_px, top, scale, dark, base[r], shape[r], height[r]
+            )
     find_line(counts, shape, height, narrowest, widest, gate_px, gate_max_px, longest, chosen)
     for r in range(rows):
         peak_of_row = chosen[r]

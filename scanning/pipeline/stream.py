@@ -23,13 +23,15 @@ from scanning.pipeline.compound import CompoundWindow
 from scanning.pipeline.exposure import exposure_grey, fuse_codes, fuse_sums, look_up
 from scanning.pipeline.grey import DARK_UNIT
 from scanning.pipeline.line import extract_line
-from scanning.pipeline.tone import GREY_TOP, broadening, fixed_point, grey_bits, scaled_codes, tone
+from scanning.pipeline.tone import GREY_TOP, broadening, fixed_point, grey_bits, light_share, scaled_codes, tone
 from scanning.range_image import RangeImage
 from scanning.recipe import Recipe
 from scanning.rig.protocols import Image
 
 FIRST_STEPS = 5
 """Stage positions looked at before the first profile when something must be estimated."""
+RAW_FLOOR = 0.1
+LOGARITHMIC_FLOOR = 0.6
 INT32_TOP = (1 << 31) - 1
 Progress = Callable[[int, int], None]
 Float64 = NDArray[np.float64]
@@ -70,6 +72,7 @@ class Settled:
     line_width_px: float | None
     expected_width_px: float | None
     k: float
+    floor: float
     estimated: tuple[str, ...]
 
 
@@ -197,13 +200,19 @@ class ProfileStream:
             selected = [0 if self.recipe.exposure == "auto" else h.exposures_us.index(float(self.recipe.exposure))]
         compressed = self.recipe.tone is not None or h.response == "logarithmic"
         k = line.k if line.k is not None else (1.5 if compressed else 3.0)
+        floor = line.floor
+        if floor is None:
+            if self.recipe.tone is not None:
+                floor = light_share(RAW_FLOOR / 2.0, self.recipe.tone.p)
+            else:
+                floor = RAW_FLOOR if h.response == "linear" else LOGARITHMIC_FLOOR
         width = h.line_width_px
         if self._measures_width():
             estimated.append("line_width_px")
             e = selected[0] if len(selected) == 1 else estimate.best_exposure(steps, darks, h.saturation)
             raw_k = 3.0 if h.response == "linear" else k
             seen = [images[e] for images in steps]
-            width = estimate.line_width_px(seen, h.saturation, darks[e], raw_k, line.floor, line.ceiling)
+            width = estimate.line_width_px(seen, h.saturation, darks[e], raw_k, RAW_FLOOR, line.ceiling)
         expected = line.width_px
         if expected is None and width is not None:
             expected = width * broadening(self.recipe.tone.p) if self.recipe.tone is not None else width
@@ -213,6 +222,7 @@ class ProfileStream:
             line_width_px=width,
             expected_width_px=expected,
             k=k,
+            floor=floor,
             estimated=tuple(estimated),
         )
         self._chain = _Chain(self.recipe, h, self.settled, selected)
@@ -234,6 +244,7 @@ class ProfileStream:
             "line_width_px": None if settled is None else settled.line_width_px,
             "expected_width_px": None if settled is None else settled.expected_width_px,
             "threshold_k": None if settled is None else settled.k,
+            "threshold_floor": None if settled is None else settled.floor,
             "estimated": [] if settled is None else list(settled.estimated),
             "notes": notes,
             "versions": {
@@ -304,7 +315,8 @@ class _Chain:
 
         width = settled.expected_width_px
         self._line = (
-            settled.k, line.floor, line.ceiling, line.valley,
+            settled.k, settled.floor, line.ceiling,
+            line.grain_px, np.inf if width is None else line.grain_span * width,
             0.0 if width is None else width / line.width_factor,
             np.inf if width is None else width * line.width_factor,
             line.gate_px, line.gate_max_px, line.seed == "longest",

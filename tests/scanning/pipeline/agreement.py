@@ -1,0 +1,95 @@
+"""Run one stack through the product and through the reference, and say whether they agree."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanning.frames import StackHeader
+from scanning.pipeline.stream import ProfileStream
+from scanning.pipeline.tone import broadening
+from scanning.recipe import Recipe
+from tests.scanning.reference.pipeline import Setting, range_columns
+
+Steps = list[list[NDArray[Any]]]
+
+
+def header_for(
+    steps: Steps,
+    exposures: tuple[float, ...] = (100.0,),
+    *,
+    dark: float | None = 2.0,
+    width: float | None = 3.0,
+    saturation: int | None = None,
+    logarithmic: bool = False,
+) -> StackHeader:
+    image = steps[0][0]
+    bits = 8 * image.dtype.itemsize
+    return StackHeader(
+        rows=image.shape[0],
+        columns=image.shape[1],
+        steps=len(steps),
+        exposures_us=(0.0,) if logarithmic else exposures,
+        step_um=8.33,
+        row_pitch_um=7.15,
+        mm_per_pixel=0.0142,
+        saturation=saturation if saturation is not None else (1 << bits) - 1,
+        line_width_px=width,
+        dark_level=dark,
+        response="logarithmic" if logarithmic else "linear",
+        bits=bits,
+    )
+
+
+def product(steps: Steps, header: StackHeader, recipe: Recipe) -> NDArray[np.float64]:
+    stream = ProfileStream(recipe, header)
+    profiles = [p for images in steps for p in stream.push(images)] + stream.finish()
+    columns = [p.column_px for p in profiles]
+    return np.stack(columns, axis=1) if columns else np.empty((header.rows, 0))
+
+
+def reference(steps: Steps, header: StackHeader, recipe: Recipe) -> NDArray[np.float64]:
+    line, sci, hdre, glt = recipe.line, recipe.compound, recipe.hdre, recipe.tone
+    assert header.dark_level is not None
+    compressed = glt is not None or header.response == "logarithmic"
+    width = line.width_px
+    if width is None and header.line_width_px is not None:
+        width = header.line_width_px * (broadening(glt.p) if glt is not None else 1.0)
+    floor = line.floor
+    if floor is None and glt is not None:
+        floor = (math.log(0.05 * 64 + 1) / math.log(65)) ** glt.p
+    elif floor is None:
+        floor = 0.6 if header.response == "logarithmic" else 0.1
+    setting = Setting(
+        order=tuple(o.key for o in recipe.operations if o.key in ("sci", "hdre", "glt")),
+        exposures=header.exposures_us,
+        dark=round(header.dark_level * 1024) / 1024,
+        saturation=header.saturation,
+        window=sci.window if sci else 1,
+        mode=sci.mode if sci else "block",
+        saturated=hdre.saturated if hdre else "all",
+        p=glt.p if glt else 0.5,
+        k=line.k if line.k is not None else (1.5 if compressed else 3.0),
+        floor=floor,
+        ceiling=line.ceiling,
+        grain=line.grain_px,
+        span=width * line.grain_span if width is not None else math.inf,
+        width=width,
+        width_factor=line.width_factor,
+        gate=line.gate_px,
+        gate_max=line.gate_max_px,
+        seed=line.seed,
+    )
+    return range_columns(steps, setting)
+
+
+def assert_agree(steps: Steps, header: StackHeader, recipe: Recipe) -> NDArray[np.float64]:
+    got, expected = product(steps, header, recipe), reference(steps, header, recipe)
+    assert got.shape == expected.shape
+    assert np.array_equal(np.isnan(got), np.isnan(expected)), "not the same rows are undefined"
+    apart = np.abs(got - expected)
+    assert not np.any(apart > 1e-4), f"columns differ by up to {np.nanmax(apart)} px"
+    return got

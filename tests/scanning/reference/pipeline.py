@@ -1,0 +1,271 @@
+"""The pipeline again, in float64, one equation after the other, slow and obvious.
+
+It shares nothing with the product but the reading of the paper, so that a mistake has to be made twice to stay hidden.
+A stack here is a list of steps, a step a list of images (shortest exposure first).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+TIE = 1e-9
+STRICT = 1 + 1e-12
+
+
+@dataclass
+class Setting:
+    """Plain values, so that the product's Recipe is not needed here."""
+
+    order: tuple[str, ...]  # of "sci", "hdre", "glt"
+    exposures: tuple[float, ...] = (1.0,)
+    dark: float = 0.0
+    saturation: int = 255
+    window: int = 5
+    mode: str = "block"
+    saturated: str = "all"
+    p: float = 0.5
+    k: float = 3.0
+    floor: float = 0.1
+    ceiling: float = 0.5
+    grain: float = 0.0  # px between two grains of one line
+    span: float = math.inf  # px, widest base of joined grains
+    width: float | None = None  # as the image shows it
+    width_factor: float = 2.0
+    gate: float = 12.0
+    gate_max: float = 64.0
+    seed: str = "longest"
+
+
+def quantised(grey: Array, window: int) -> Array:
+    bits = 20
+    while 255 * 2**bits * window >= 2**31:
+        bits -= 1
+    return np.rint(grey * 2.0**bits) / 2.0**bits
+
+
+def eq_6(images: list[Array], saturated: list[NDArray[np.bool_]], s: Setting) -> Array:
+    """Longest unsaturated exposure over its time, black level off first, as a share of Sat / e_1, times 255."""
+    full = (s.saturation - s.dark) / s.exposures[0]
+    result = np.full(images[0].shape, 255.0)
+    for image, is_saturated, e in zip(images, saturated, s.exposures, strict=True):
+        g = 255.0 * np.maximum(image - s.dark, 0.0) / e / full
+        result = np.where(is_saturated, result, g)
+    return result
+
+
+def eq_7(g: Array, p: float) -> Array:
+    return 255.0 * (np.log(g + 1.0) / math.log(256.0)) ** p
+
+
+def windows(steps: int, s: Setting) -> list[range]:
+    if "sci" not in s.order:
+        return [range(i, i + 1) for i in range(steps)]
+    if s.mode == "block":
+        return [range(n * s.window, (n + 1) * s.window) for n in range(steps // s.window)]
+    return [range(i, i + s.window) for i in range(steps - s.window + 1)]
+
+
+def grey_images(stack: list[list[NDArray[Any]]], s: Setting) -> list[Array]:
+    """The image MSNN sees, per profile; black level already off."""
+    out = []
+    window = s.window if "sci" in s.order else 1
+    for span in windows(len(stack), s):
+        codes = [[np.minimum(image.astype(float), s.saturation) for image in stack[i]] for i in span]
+        fused_first = "hdre" in s.order and (
+            "sci" not in s.order or s.order.index("hdre") < s.order.index("sci")
+        )
+        tone_first = "glt" in s.order and ("sci" not in s.order or s.order.index("glt") < s.order.index("sci"))
+        if fused_first or (tone_first and "hdre" not in s.order):
+            singles = []
+            for images in codes:
+                if fused_first:
+                    g = eq_6(images, [image >= s.saturation for image in images], s)
+                else:
+                    g = 255.0 * np.maximum(images[0] - s.dark, 0.0) / (s.saturation - s.dark)
+                if tone_first:
+                    g = eq_7(g, s.p)
+                singles.append(quantised(g, window))
+            image = sum(singles) / window
+            if "glt" in s.order and not tone_first:
+                image = quantised(eq_7(image, s.p), 1)
+        else:
+            means = [sum(step[e] for step in codes) / window for e in range(len(codes[0]))]
+            if "hdre" in s.order:
+                full = [sum((step[e] >= s.saturation).astype(int) for step in codes) for e in range(len(codes[0]))]
+                need = window if s.saturated == "all" else 1
+                image = eq_6(means, [count >= need for count in full], s)
+                if "glt" in s.order:
+                    image = eq_7(image, s.p)
+                image = quantised(image, window)
+            elif "glt" in s.order:
+                g = 255.0 * np.maximum(means[0] - s.dark, 0.0) / (s.saturation - s.dark)
+                image = quantised(eq_7(g, s.p), window)
+            else:
+                image = np.maximum(means[0] - s.dark, 0.0)
+        out.append(image)
+    return out
+
+
+@dataclass
+class Peak:
+    first: int
+    last: int
+    height: float
+    left: float = 0.0
+    right: float = 0.0
+
+    @property
+    def width(self) -> float:
+        return self.right - self.left
+
+    @property
+    def middle(self) -> float:
+        return (self.left + self.right) / 2
+
+
+def peaks_of_row(row: Array, threshold: float, s: Setting) -> list[Peak]:
+    P = row  # noqa: N806 - the letter of eq. (8)
+    above = threshold * STRICT < P
+    peaks: list[Peak] = []
+    c = 0
+    while c < P.size:
+        if not above[c]:
+            c += 1
+            continue
+        end = c
+        while end + 1 < P.size and above[end + 1]:
+            end += 1
+        # cut the run [c, end] where the last non-zero gradient was negative and the next one is positive
+        cuts = []
+        sign = 0
+        for i in range(c + 1, end + 1):
+            d = P[i] - P[i - 1]
+            if d > 0 and sign < 0:
+                cuts.append(i)
+            if d != 0:
+                sign = 1 if d > 0 else -1
+        edges = [c, *cuts, end + 1]
+        pieces = [Peak(a, b - 1, float(P[a:b].max())) for a, b in pairwise(edges)]
+        peaks += pieces
+        c = end + 1
+    if s.grain > 0:
+        peaks = grains_joined(peaks, s)
+    for peak in peaks:
+        half = peak.height / 2
+        higher = [i for i in range(peak.first, peak.last + 1) if P[i] > half]
+        i, j = higher[0], higher[-1]
+        peak.left = i - 0.5
+        if i > 0 and P[i - 1] <= half:
+            peak.left = i - (P[i] - half) / (P[i] - P[i - 1])
+        peak.right = j + 0.5
+        if j < P.size - 1 and P[j + 1] <= half:
+            peak.right = j + (P[j] - half) / (P[j] - P[j + 1])
+    return peaks
+
+
+def grains_joined(peaks: list[Peak], s: Setting) -> list[Peak]:
+    joined: list[Peak] = []
+    for peak in peaks:
+        if joined:
+            before = joined[-1]
+            dark_between = peak.first - before.last - 1
+            base = peak.last - before.first + 1
+            if dark_between <= s.grain and base <= s.span:
+                joined[-1] = Peak(before.first, peak.last, max(before.height, peak.height))
+                continue
+        joined.append(peak)
+    return joined
+
+
+def passes(peak: Peak, s: Setting) -> bool:
+    return s.width is None or s.width / s.width_factor <= peak.width <= s.width * s.width_factor
+
+
+def followed(rows: list[list[Peak]], row: int, k: int, s: Setting) -> list[int]:
+    chosen = [-1] * len(rows)
+    chosen[row] = k
+    for order in (range(row - 1, -1, -1), range(row + 1, len(rows))):
+        last, missed = rows[row][k], 0
+        for r in order:
+            gate = min(s.gate * (1 + missed), s.gate_max) + TIE
+            best, least = -1, math.inf
+            for n, peak in enumerate(rows[r]):
+                moved = abs(peak.middle - last.middle)
+                cost = moved + abs(peak.width - last.width)
+                if moved <= gate and cost < least - TIE:
+                    best, least = n, cost
+            chosen[r] = best
+            if best >= 0:
+                last, missed = rows[r][best], 0
+            else:
+                missed += 1
+    return chosen
+
+
+def the_line(rows: list[list[Peak]], s: Setting) -> list[int]:
+    none = [-1] * len(rows)
+    bottom_up = range(len(rows) - 1, -1, -1)
+    lone = [(r, 0) for r in bottom_up if len(rows[r]) == 1 and passes(rows[r][0], s)]
+    ratios = []
+    for r in bottom_up:
+        for k, peak in enumerate(rows[r]):
+            if passes(peak, s):
+                others = [p.height for n, p in enumerate(rows[r]) if n != k]
+                ratios.append((peak.height / max(others) if others else math.inf, r, k))
+    if not ratios:
+        return none
+    best_ratio = ratios[0]
+    for entry in ratios[1:]:
+        if entry[0] > best_ratio[0] * STRICT:
+            best_ratio = entry
+    seeds = lone or [best_ratio[1:]]
+    if s.seed == "first":
+        return followed(rows, *seeds[0], s)
+    seeds = seeds + [(r, k) for r in bottom_up for k in range(len(rows[r])) if passes(rows[r][k], s)]
+    visited: set[tuple[int, int]] = set()
+    best, most, tried = none, 0, 0
+    with_peaks = sum(1 for peaks in rows if peaks)
+    for seed in seeds:
+        if seed in visited:
+            continue
+        line = followed(rows, *seed, s)
+        on_line = [(r, k) for r, k in enumerate(line) if k >= 0]
+        visited |= set(on_line)
+        score = sum(1 for r, k in on_line if passes(rows[r][k], s))
+        if score > most:
+            best, most = line, score
+        tried += 1
+        if 2 * most > with_peaks or tried == 32:
+            break
+    return best
+
+
+def profile(image: Array, s: Setting) -> Array:
+    """MSNN and eq. (8) on one image whose black level is off; NaN where there is no line."""
+    maxima = image.max(axis=1)
+    asked = s.k * image.mean()
+    if s.ceiling > 0:
+        asked = min(asked, s.ceiling * maxima.mean())
+    rows = [peaks_of_row(P, max(asked, s.floor * P.max()), s) for P in image]
+    out = np.full(len(rows), np.nan)
+    for r, k in enumerate(the_line(rows, s)):
+        if k >= 0:
+            mask = np.zeros(image.shape[1])
+            mask[rows[r][k].first : rows[r][k].last + 1] = 1
+            columns = np.arange(image.shape[1])
+            light = (image[r] * mask).sum()
+            if light > 0:
+                out[r] = (columns * image[r] * mask).sum() / light
+    return out
+
+
+def range_columns(stack: list[list[NDArray[Any]]], s: Setting) -> Array:
+    """(rows, profiles) columns of the line, px from 0."""
+    return np.stack([profile(image, s) for image in grey_images(stack, s)], axis=1)
