@@ -8,7 +8,7 @@ Every call either returns, or raises a `RigFault` within a time it owns. Nothing
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,4 +97,21 @@ class Camera(Protocol):
     def configure(self, mode: SensorMode) -> None: ...
     def grab(self, exposure_us: float, *, timeout_s: float) -> Frame:
         """Expose once and return the frame, or raise `CameraFault` within ``timeout_s`` plus the exposure."""
+        ...
+
+
+@runtime_checkable
+class OverlappingCamera(Protocol):
+    """A camera that tells when the shutter has closed, so that the stage may move on while the frame is read out.
+
+    Any number of exposures up to one bracket may be taken before they are read out, oldest first. A camera without this
+    ability (plain `Camera`) still works; each step then takes its read-out time longer.
+    """
+
+    def expose(self, exposure_us: float, *, timeout_s: float) -> None:
+        """Expose once and return when the shutter has closed."""
+        ...
+
+    def read_out(self, *, timeout_s: float) -> Frame:
+        """Return the oldest frame not read yet, or raise `CameraFault` within ``timeout_s``."""
         ...

@@ -110,6 +110,17 @@ class Controller:
         self.max_rx_used = 0
         self._g54 = np.zeros(3, np.float32)
         self.state = "Idle"
+        self._modal = _Modal()
+        self._rx: deque[int] = deque()
+        self._line, self._line_overflow = "", False
+        self._spindle_rpm = self._idle_scale = 0.0
+        self._g92 = np.zeros(3, np.float32)
+        self._gc = np.zeros(3, np.float32)
+        self._dwell_until: float | None = None
+        self._critical = self._check = self._jog_cancelled = self._homing_hit = False
+        self._wco_in = self._ov_in = 0
+        self._program: Program = self._main()
+        self._waiting: Until | None = None
         self._start_fresh()
         if self.settings[22]:
             self.state = "Alarm"
@@ -178,7 +189,7 @@ class Controller:
         self._outgoing.clear()
         if self.state == "Home":
             self._alarm(6)
-            self._program, self._waiting = self._main(), None
+            self._restart_program()
         elif self._boot_until is None:
             self._feed_hold()
 
@@ -318,23 +329,22 @@ class Controller:
     # ---- resets, holds, alarms ----------------------------------------------------------------------------------
 
     def _start_fresh(self) -> None:
+        """What a reset of the processor leaves of the program's state; settings, G54 and the count survive."""
         self._modal = _Modal()
-        self._rx: deque[int] = deque()
-        self._line = ""
-        self._line_overflow = False
-        self._spindle_rpm = 0.0
-        self._idle_scale = 0.0
+        self._rx.clear()
+        self._line, self._line_overflow = "", False
+        self._spindle_rpm = self._idle_scale = 0.0
         self._g92 = np.zeros(3, np.float32)
         self._gc = self._mpos(self._motion.end)
-        self._dwell_until: float | None = None
-        self._critical = False
-        self._check = False
-        self._jog_cancelled = False
-        self._homing_hit = False
+        self._dwell_until = None
+        self._critical = self._check = self._jog_cancelled = self._homing_hit = False
         self._wco_in = self._ov_in = 0
-        self._program: Program = self._main()
-        self._waiting: Until | None = None
+        self._restart_program()
         self._fault_at = None
+
+    def _restart_program(self) -> None:
+        self._program = self._main()
+        self._waiting = None
 
     def _lose_count(self) -> None:
         self._motion.drop(self.now)
@@ -355,7 +365,7 @@ class Controller:
         )
         code = 6 if self.state == "Home" else 3
         self._outgoing_before_reset()
-        if under_way and not self._motion.idle or self.state == "Home":
+        if (under_way and not self._motion.idle) or self.state == "Home":
             self._motion.drop(self.now)
             self._say(f"ALARM:{code}")
             self.state = "Alarm"
@@ -401,7 +411,7 @@ class Controller:
         self._gc = self._mpos(self._motion.end)
         self.state = "Alarm"
         self._critical = True
-        self._program, self._waiting = self._main(), None
+        self._restart_program()
         self._say(f"ALARM:{code}")
         self._say("[MSG:Reset to continue]")
 
@@ -426,8 +436,8 @@ class Controller:
             return None
         block = self._motion.blocks[0]
         if block.end[0] < block.start[0]:
-            return self._motion.when_reached(0, -self._zero_on_screw - 0.5)
-        return self._motion.when_reached(0, self._far_switch - self._zero_on_screw - 0.5)
+            return self._motion.when_reached(0, -self._zero_on_screw)
+        return self._motion.when_reached(0, self._far_switch - self._zero_on_screw)
 
     def _switch_hit(self) -> None:
         if self.state == "Home":
@@ -447,7 +457,9 @@ class Controller:
     def _arm_fault(self) -> None:
         """Put an armed fault into the middle of the move that is under way."""
         end = self._motion.next_event()
-        if self.faults.in_move is not None and self._fault_at is None and end is not None and self.state in ("Run", "Jog"):
+        if end is None or self.faults.in_move is None or self._fault_at is not None:
+            return
+        if self.state in ("Run", "Jog"):
             self._fault_at = self.now + 0.5 * (end - self.now)
 
     def _mpos(self, steps: Steps) -> Float3:
@@ -532,7 +544,7 @@ class Controller:
                 self._say("[MSG:Caution: Unlocked]")
                 self.state = "Idle"
         elif rest == "C":
-            yield from self._check_mode()
+            self._check_mode()
         elif self.state not in ("Idle", "Alarm"):
             raise _GcodeError(8)
         elif rest == "$":
@@ -573,7 +585,7 @@ class Controller:
         if number == 22 and not value:
             self.settings[20] = 0
 
-    def _check_mode(self) -> Program:
+    def _check_mode(self) -> None:
         if self._check:
             self._check = False
             self._say("[MSG:Disabled]")
@@ -583,8 +595,6 @@ class Controller:
         else:
             self._check = True
             self._say("[MSG:Enabled]")
-        return
-        yield  # a program like its siblings
 
     def _home(self) -> Program:
         """Seek the switch fast, back off, find it again slowly, back off; then the count is defined."""
