@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from scanning.errors import BadInput
 from scanning.rig.protocols import Image
-from scanning.rig.simulated.geometry import WORKING_HEIGHT_UM
+from scanning.rig.simulated.geometry import IS1, IS2, WORKING_HEIGHT_UM
 from scanning.rig.simulated.randomness import grain_field
-from scanning.rig.simulated.scenes import Scene
+from scanning.rig.simulated.scenes import Scene, scene
 from scanning.rig.simulated.sensor import Sensor, sensor_for
 from scanning.rig.simulated.speckle import GUARD, SAMPLES_PER_PIXEL, CoherentCamera, speckle_tile
 
@@ -50,6 +50,13 @@ def _add_glare(frame: Float32, energy: Float32, moment: Float32, halo: Float32) 
         middle = int(moment[r] / energy[r] + 0.5)
         for c in range(frame.shape[1]):
             frame[r, c] += energy[r] * halo[abs(c - middle)]
+
+
+def warm_up() -> None:
+    """Compile everything a first frame needs, so that no camera seems silent for seconds on a fresh machine."""
+    for system in (IS1, IS2):
+        renderer = Renderer(scene("R2", system=system, wear_um=1.0), rows=32, columns=32)
+        renderer.expose(renderer.irradiance(0.0), 100.0, np.random.default_rng(0))
 
 
 class Renderer:

@@ -218,11 +218,17 @@ class Scene:
         }
 
 
-Stray = Literal["none", "moderate", "hard"]
+Stray = Literal["none", "moderate", "busy", "hard"]
 
 REFLECTIONS: dict[str, tuple[Reflection, ...]] = {
     "none": (),
     "moderate": (
+        SecondLine(0.62, 0.70, -46.0, 0.02, 2.6, 0.3, drift_px_per_mm=-3.0),
+        Spot(0.30, 58.0, 5.0, 4.0, 3.0, drift_px_per_mm=2.0),
+        Spot(0.88, -76.0, 8.0, 6.0, 1.5),
+        Arc(0.16, 46.0, 62.0, 2.0, -65.0, 55.0, 2.5),
+    ),
+    "busy": (
         SecondLine(0.56, 0.80, -46.0, 0.02, 2.6, 0.45, drift_px_per_mm=-3.0),
         Spot(0.30, 55.0, 7.0, 5.0, 3.0, drift_px_per_mm=2.0),
         Spot(0.87, -72.0, 10.0, 8.0, 1.5),
@@ -373,9 +379,9 @@ def scene(
 
     ``seed`` is the individual part: its texture, stains and speckle. ``wear_um`` mean edge recession. ``visit`` lays
     the part on the rig anew (0: exactly as asked). ``decades`` scales the spread of reflectivity (0 uniform; 1 for the
-    knife and the gauge, 0 for the plate). ``stray`` reflections: none, moderate (the knife's default) or hard. Tilts in
-    degrees (knife 0.4 across, 0.1 along; others 0). ``texture_um`` Sq of the grinding marks (0.35 on the knife).
-    ``damages`` replaces the scene's own. Raises BadInput for anything unknown.
+    knife and the gauge, 0 for the plate). ``stray`` reflections: none, moderate (the knife's default), busy, hard.
+    Tilts in degrees (knife 0.4 across, 0.1 along; others 0). ``texture_um`` Sq of the grinding marks (0.35 on the
+    knife). ``damages`` replaces the scene's own. Raises BadInput for anything unknown.
     """
     if name not in SCENES:
         raise BadInput(f"There is no scene {name!r}; choose one of {', '.join(SCENES)}.")

@@ -43,7 +43,7 @@ def test_the_gauge_carries_table_2() -> None:
 
 
 def test_stray_light_can_outshine_the_line_and_moves_in_its_own_way() -> None:
-    clean, stray = scene("R1", seed=4, stray="none"), scene("R1", seed=4)
+    clean, stray = scene("R1", seed=4, stray="none"), scene("R1", seed=4, stray="busy")
     at = [Renderer(stray).irradiance(p) - Renderer(clean).irradiance(p) for p in (0.0, 2000.0)]
     assert all(frame.min() > -1e-3 for frame in at)
     assert at[0].max() > 2 * stray.level_e_per_us
@@ -52,6 +52,16 @@ def test_stray_light_can_outshine_the_line_and_moves_in_its_own_way() -> None:
     assert moved[1] - moved[0] == pytest.approx(-6.0, abs=1.0)
     line = [float((f[280:330, 150:220].sum(0) * columns[150:220]).sum() / f[280:330, 150:220].sum()) for f in at]
     assert line[1] - line[0] == pytest.approx(4.0, abs=1.0)
+
+
+def test_the_knife_has_some_stray_light_unless_told_otherwise() -> None:
+    usual, clean = (
+        Renderer(scene("R1", seed=4)).irradiance(0.0),
+        Renderer(scene("R1", seed=4, stray="none")).irradiance(0.0),
+    )
+    brighter = np.abs(usual - clean) > 1.0
+    assert 0.001 < brighter.mean() < 0.01
+    assert not brighter[700:820].any()
 
 
 @pytest.mark.parametrize("name", list(REFLECTIONS))
