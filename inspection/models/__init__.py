@@ -7,8 +7,9 @@ from inspection.models.results import Damage, Measurement, PrecisionReport, Rang
 from inspection.models.rigs import Calibration, Limit, LimitSet, Recipe, Rig
 from inspection.models.scans import Inspection, Scan
 from inspection.models.schedules import DueSlot, Schedule
+from inspection.models.tokens import ApiToken
 
 __all__ = [
-    "AuditEvent", "Calibration", "Damage", "DueSlot", "Event", "Inspection", "Limit", "LimitSet", "Measurement",
+    "ApiToken", "AuditEvent", "Calibration", "Damage", "DueSlot", "Event", "Inspection", "Limit", "LimitSet", "Measurement",
     "PrecisionReport", "RangeImage", "Recipe", "Recomputation", "Region", "Rig", "Role", "Scan", "Schedule", "Tool", "ToolType", "User",
 ]  # fmt: skip
