@@ -30,8 +30,9 @@ GUARD = 8
 _TAPS = 4
 _BETA = 9.2
 _BINS = 2048
-_SIDE = 24
-"""Free samples on either side of the line: the field must have faded before it meets itself on the periodic grid."""
+_SIDE = {"linear": 32, "logarithmic": 96}
+"""Free samples on either side of the line: the field must have faded before it meets itself on the periodic grid. A
+logarithmic camera still sees the pupil's diffraction far from the line, where a linear one reads zero."""
 
 
 def _spreading_table() -> Float32:
@@ -204,8 +205,9 @@ class CoherentCamera:
             for x in (float(x_um.min()), float(x_um.max()))
             for z in (low, high)
         ]
-        first = int(np.floor(min(corners))) - _SIDE // SAMPLES_PER_PIXEL
-        last = int(np.ceil(max(corners))) + _SIDE // SAMPLES_PER_PIXEL
+        side = _SIDE[self._system.response] // SAMPLES_PER_PIXEL
+        first = int(np.floor(min(corners))) - side
+        last = int(np.ceil(max(corners))) + side
         # Widths in steps of 16 samples, so that only a few pupils are ever built.
         width = SAMPLES_PER_PIXEL * (last - first)
         width = scipy.fft.next_fast_len(width + (-width) % 16)

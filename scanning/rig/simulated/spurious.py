@@ -23,6 +23,10 @@ from numpy.typing import NDArray
 Float32 = NDArray[np.float32]
 
 
+_REACH = 5.5
+"""Standard deviations after which a reflection ends: below 3e-7 of its peak, nothing even on a logarithmic camera."""
+
+
 class Reflection(Protocol):
     def add(self, frame: Float32, tile: Float32, position_um: float, level: float) -> None:
         """Add this reflection to ``frame`` (rows, columns) at one stage position; ``tile`` is speckle of mean 1."""
@@ -57,7 +61,7 @@ def _add_line(
         # Fades over its outer tenth instead of being cut.
         end = min(r - first, last - r) / (0.1 * (last - first) + 1e-9)
         strength = level * min(1.0, end)
-        for c in range(max(0, int(middle - 4 * sigma)), min(frame.shape[1], int(middle + 4 * sigma) + 2)):
+        for c in range(max(0, int(middle - _REACH * sigma)), min(frame.shape[1], int(middle + _REACH * sigma) + 2)):
             value = strength * math.exp(-0.5 * ((c - middle) / sigma) ** 2)
             frame[r, c] += value * _textured(tile, r, c, shift)
 
@@ -73,10 +77,12 @@ def _add_spot(
     level: float,
     shift: float,
 ) -> None:
-    for r in range(max(0, int(row - 4 * sigma_row)), min(frame.shape[0], int(row + 4 * sigma_row) + 2)):
-        for c in range(max(0, int(column - 4 * sigma_column)), min(frame.shape[1], int(column + 4 * sigma_column) + 2)):
+    for r in range(max(0, int(row - _REACH * sigma_row)), min(frame.shape[0], int(row + _REACH * sigma_row) + 2)):
+        for c in range(
+            max(0, int(column - _REACH * sigma_column)), min(frame.shape[1], int(column + _REACH * sigma_column) + 2)
+        ):
             q = ((r - row) / sigma_row) ** 2 + ((c - column) / sigma_column) ** 2
-            if q < 16.0:
+            if q < _REACH**2:
                 frame[r, c] += level * math.exp(-0.5 * q) * _textured(tile, r, c, shift)
 
 
@@ -93,8 +99,8 @@ def _add_arc(
     level: float,
     shift: float,
 ) -> None:
-    outer = radius + 4 * sigma
-    inner = max(0.0, radius - 4 * sigma)
+    outer = radius + _REACH * sigma
+    inner = max(0.0, radius - _REACH * sigma)
     for r in range(max(0, int(row - outer)), min(frame.shape[0], int(row + outer) + 2)):
         for c in range(max(0, int(column - outer)), min(frame.shape[1], int(column + outer) + 2)):
             q = (r - row) ** 2 + (c - column) ** 2
