@@ -8,7 +8,8 @@ message could be lost and a signal would skip the code that turns the laser off.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import zlib
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from django.db import transaction
@@ -143,7 +144,7 @@ def plan_for(region: Region, rig: Rig, exposures_us: Sequence[float], recipe: Re
     Keys: start_mm, length_mm, steps (scan images), motor_steps_per_profile, step_um, exposures_us, rows, row_offset,
     columns, column_offset, flat_row, flat_rows, region (its name).
     """
-    camera, stage = rig.config.get("camera", {}), rig.config.get("stage", {})
+    sensor, stage = rig.config.get("sensor", {}), rig.config.get("stage", {})
     motor_step_um = float(stage.get("step_um", MOTOR_STEP_UM))
     step_um = MOTOR_STEPS_PER_PROFILE * motor_step_um
     if not (math.isfinite(region.start_mm) and math.isfinite(region.length_mm)) or region.length_mm <= 0:
@@ -165,13 +166,35 @@ def plan_for(region: Region, rig: Rig, exposures_us: Sequence[float], recipe: Re
         "exposures_us": list(exposures_us),
         "rows": region.rows,
         "row_offset": region.row_offset,
-        "columns": int(camera.get("columns", COLUMNS)),
-        "column_offset": int(camera.get("column_offset", 0)),
+        "columns": int(sensor.get("columns", COLUMNS)),
+        "column_offset": int(sensor.get("column_offset", 0)),
         "flat_row": region.flat_row,
         "flat_rows": region.flat_rows,
     }
+    if (simulated := rig.config.get("simulated")) is not None:
+        plan["part"] = part_for(region, simulated, str(rig.config.get("system", "IS1")))
     check_recipe(recipe, plan, f"Region {region.name} of {region.tool.code}")
     return plan
+
+
+def part_for(region: Region, simulated: Mapping[str, Any], system: str) -> dict[str, Any]:
+    """Which part lies on a simulated rig, in the words of its camera's ``load_part``.
+
+    A real rig has a person who lays the tool on. Here ``simulated["parts"][tool code][region name]`` may say it (scene,
+    seed, wear_um); else each tool is an individual of its own, and its regions R1 to R3 are the paper's.
+    """
+    from scanning.rig.simulated.scenes import SCENES
+
+    tool = region.tool
+    told = simulated.get("parts", {}).get(tool.code, {}).get(region.name, {})
+    return {
+        "scene": region.name if region.name in SCENES else "R1",
+        "seed": zlib.crc32(tool.code.encode()) % 1_000_000,
+        "wear_um": 0.0,
+        "visit": tool.inspections.count(),
+        "system": system,
+        **told,
+    }
 
 
 def check_recipe(recipe: Recipe, plan: dict[str, Any], where: str) -> None:

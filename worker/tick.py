@@ -1,0 +1,61 @@
+"""Once a minute: queue what is due, ring again where a ring may have been lost, find workers that died.
+
+Everything is looked up in the rows and everything may run twice or late. This is what makes the doorbell optional: with
+the broker away for an hour, the first tick after it starts all that waited.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import logging
+
+from django.db.models import Q
+from django.utils import timezone
+
+from inspection.models import Recomputation, Rig, Scan
+from inspection.services import schedules
+from inspection.services.ring import ring, ring_measure, ring_recompute
+from inspection.states import QueueState, ScanState
+from worker import lease
+from worker.celery import app
+from worker.compute import RECOMPUTATION_LOST
+
+log = logging.getLogger(__name__)
+
+#: A scan may wait this long for its numbers before it is rung for again.
+COMPUTE_PATIENCE = dt.timedelta(seconds=30)
+
+
+@app.task(name="worker.tick", ignore_result=True)
+def tick() -> None:
+    """The minute's work, in order: dead workers, due dates, rigs with waiting scans, numbers that wait."""
+    now = timezone.now()
+    lease.sweep(now)
+    summary = schedules.tick(now)
+    for inspection in summary.queued:
+        log.info("Queued %s by its schedule.", inspection)
+    for schedule, why in summary.refused:
+        log.warning("%s could not be queued: %s", schedule, why)
+    ring_what_waits(now)
+
+
+@app.task(name="worker.sweep", ignore_result=True)
+def sweep() -> None:
+    """Find workers that died, between the ticks."""
+    for scan_id in lease.sweep():
+        log.warning("Scan %s was interrupted: its worker let the lease run out.", scan_id)
+
+
+def ring_what_waits(now: dt.datetime) -> None:
+    """Ring for every rig with a queued scan and for every computation that nobody is at."""
+    for slug in Rig.objects.filter(
+        active=True, queue_state=QueueState.READY, scans__state=ScanState.QUEUED
+    ).distinct().values_list("slug", flat=True):
+        ring(slug)
+    free = Q(lease_until__isnull=True) | Q(lease_until__lt=now)
+    late = Q(progress_at__isnull=True) | Q(progress_at__lt=now - COMPUTE_PATIENCE)
+    for scan_id in Scan.objects.filter(free, late, state=ScanState.PROCESSING).values_list("pk", flat=True):
+        ring_measure(scan_id)
+    lost = Q(state=Recomputation.State.RUNNING, started_at__lt=now - RECOMPUTATION_LOST)
+    for order_id in Recomputation.objects.filter(lost | Q(state=Recomputation.State.QUEUED)).values_list("pk", flat=True):
+        ring_recompute(order_id)
