@@ -92,18 +92,21 @@ class Line:
     ``k``: threshold as a multiple of the mean of the image; None means 3, or 1.5 on compressed grey (after GLT, or
     from a logarithmic camera). ``floor``: the threshold is never under this share of the row's maximum; None means
     0.1, after GLT what 0.05 of the light became (0.59 at p = 0.5), 0.6 from a logarithmic camera.
+    The share counts from the row's mean (``floor_from`` "row_mean") or from "zero".
     ``ceiling``: the image mean asks for no more than this share of the mean row maximum (0: no ceiling).
     ``grain_px``: peaks this many pixels or less apart are grains of one line (0: never), as long as together they are
     no wider than ``grain_span`` x the line's width. ``width_px``: line width in px, None takes the header's, or
     estimates it. ``width_factor``: a peak passes the width check between width/factor and width*factor. ``gate_px``,
     ``gate_max_px``: how far the line may move from row to row: gate_px (1 + rows missed), at most gate_max_px.
     ``seed``: ``first`` follows the line from the first good row from the bottom; ``longest`` tries the others too when
-    that line turns out short. The paper to the letter is floor 0.1, ceiling 0, grain_px 0, seed first.
+    that line turns out short. The paper to the letter is floor 0.1, floor_from
+    zero, ceiling 0, grain_px 0, seed first.
     """
 
     key: ClassVar[str] = "msnn"
     k: float | None = None
     floor: float | None = None
+    floor_from: str = "row_mean"
     ceiling: float = 0.5
     grain_px: float = 3.0
     grain_span: float = 3.0
@@ -118,6 +121,7 @@ class Line:
             _number("msnn.k", self.k, 0.0, 1000.0, above=True)
         if self.floor is not None:
             _number("msnn.floor", self.floor, 0.0, 0.99)
+        _choice("msnn.floor_from", self.floor_from, ("row_mean", "zero"))
         _number("msnn.ceiling", self.ceiling, 0.0, 1.0)
         _number("msnn.grain_px", self.grain_px, 0.0, 1e5)
         _number("msnn.grain_span", self.grain_span, 0.0, 1e5)
@@ -377,7 +381,7 @@ _READERS: dict[str, Callable[[str, str], Any]] = {
     "k": _read_float_or_default, "floor": _read_float_or_default, "ceiling": _read_float, "grain_px": _read_float,
     "grain_span": _read_float,
     "width_px": _read_float_or_default, "width_factor": _read_float, "gate_px": _read_float,
-    "gate_max_px": _read_float, "seed": _read_text,
+    "gate_max_px": _read_float, "seed": _read_text, "floor_from": _read_text,
 }  # fmt: skip
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanning.pipeline.grey import DARK_UNIT
-from scanning.pipeline.line import light_sum, lowest_code_above, row_maxima, row_peaks
+from scanning.pipeline.line import lowest_code_above, row_light, row_maxima, row_peaks
 
 PIXELS_LOOKED_AT = 1 << 16
 FEWEST_ROWS = 8
@@ -40,12 +40,13 @@ def half_sample_mode(values: NDArray[np.generic]) -> float:
 def dark_level(images: Sequence[Image], saturation: int) -> float:
     """Grey level off the line: the most crowded level of the unsaturated pixels of these images of one exposure.
 
-    Where a lamp lights the scene this is the lit background, and subtracting it is what is wanted.
+    Where a lamp lights the scene this is the lit background, and subtracting it is what is wanted. There the most
+    crowded level of a long exposure can be the camera's soft top; the median is lower then, and is taken.
     """
     every = max(1, sum(image.size for image in images) // PIXELS_LOOKED_AT)
     pixels = np.concatenate([image.ravel()[::every] for image in images])
     pixels = pixels[pixels < saturation]
-    return half_sample_mode(pixels) if pixels.size else 0.0
+    return min(half_sample_mode(pixels), float(np.median(pixels))) if pixels.size else 0.0
 
 
 def line_width_px(
@@ -63,13 +64,17 @@ def line_width_px(
         highest = np.empty(rows, image.dtype)
         row_maxima(image, highest)
         maxima = np.maximum(np.minimum(highest.astype(np.int64), saturation) * DARK_UNIT - level, 0)
-        asked = k * light_sum(image, saturation, DARK_UNIT, level) / image.size
+        light = np.empty(rows, np.int64)
+        row_light(image, saturation, DARK_UNIT, level, light)
+        asked = k * float(light.sum()) / image.size
         if ceiling > 0:
             asked = min(asked, ceiling * float(maxima.mean()))
         most = columns // 2 + 1
         base, shape, height = np.empty((most, 2), np.int64), np.empty((most, 2)), np.empty(most, np.int64)
         for r in range(rows):
-            lowest = lowest_code_above(max(asked, floor * float(maxima[r])), DARK_UNIT, level)
+            background = float(light[r]) / columns
+            threshold = max(asked, background + floor * (float(maxima[r]) - background))
+            lowest = lowest_code_above(threshold, DARK_UNIT, level)
             if min(int(highest[r]), saturation) < lowest:
                 continue
             found = row_peaks(image[r], lowest, GRAIN_PX, np.inf, saturation, DARK_UNIT, level, base, shape, height)

@@ -4,11 +4,12 @@ A machined metal surface throws reflections beside the line, often brighter than
 row follows them in a fifth to a quarter of the rows. MSNN uses what a reflection does not share with the line: its
 width, and being where the line was in the row before.
 
-1. Peaks. A row's threshold is k times the mean of the image, but not under ``floor`` x the row's maximum; k times the
-   mean is cut at ``ceiling`` x the mean of all row maxima, because in a narrow or bright image it would rise above the
-   line itself. A peak starts where the row rises above the threshold (strictly) and ends where it falls to it, at the
-   last column, or where the gradient turns from negative to positive: at that valley pixel, which still belongs to
-   it. On flat stretches the last gradient that was not zero counts. Coherent light makes grains of the line, so taken
+1. Peaks. A row's threshold is k times the mean of the image, but not under a share (``floor``) of the row's maximum;
+   the share counts from the row's mean (``floor_from``), because a lamp or GLT can lift the whole background above a
+   tenth of the maximum. k times the mean is cut at ``ceiling`` x the mean of all row maxima, because in a narrow or
+   bright image it would rise above the line itself. A peak starts where the row rises above the threshold (strictly)
+   and ends where it falls to it, at the last column, or where the gradient turns from negative to positive: at that
+   valley pixel, which still belongs to it. On flat stretches the last gradient that was not zero counts. Coherent light makes grains of the line, so taken
    literally a "peak" is often one grain of it: neighbouring peaks no more than ``grain_px`` pixels apart are one, as
    long as their common base is no wider than ``grain_span`` x the line. Measured on coherent speckle (f/5.6, 160
    columns, one exposure): sigma 15.6 um and response slope 0.73-0.89 literally, 8.1 um and 0.99-1.00 joined.
@@ -55,11 +56,10 @@ def row_maxima(image, highest):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def light_sum(image, top, scale, dark):  # type: ignore[no-untyped-def]
-    """Sum of the light of all pixels, exact."""
+def row_light(image, top, scale, dark, light):  # type: ignore[no-untyped-def]
+    """Sum of the light of every row, exact."""
     rows, columns = image.shape
     nothing = dark // scale
-    total = np.int64(0)
     for r in range(rows):
         codes = np.int64(0)
         lit = np.int64(0)
@@ -68,8 +68,7 @@ def light_sum(image, top, scale, dark):  # type: ignore[no-untyped-def]
             if code > nothing:
                 codes += code
                 lit += 1
-        total += codes * scale - lit * dark
-    return total
+        light[r] = codes * scale - lit * dark
 
 
 @nb.njit(cache=True, nogil=True)
@@ -269,17 +268,19 @@ def find_line(counts, shape, height, narrowest, widest, gate_px, gate_max_px, lo
 
 @nb.njit(cache=True, nogil=True)
 def extract_line(  # type: ignore[no-untyped-def]
-    image, top, scale, dark, k, floor, ceiling, grain_px, span_px, narrowest, widest, gate_px, gate_max_px, longest,
-    highest, base, shape, height, counts, chosen, column_px, peak, width_px,
+    image, top, scale, dark, k, floor, from_row_mean, ceiling, grain_px, span_px, narrowest, widest, gate_px,
+    gate_max_px, longest,
+    highest, light, base, shape, height, counts, chosen, column_px, peak, width_px,
 ):  # fmt: skip
     """MSNN then COG on one (rows, columns) image of integer codes (see `grey.grey` for top, scale, dark).
 
     Writes, per row, column_px (px from 0, NaN undefined), peak (light of the line's maximum) and width_px (full width
-    at half maximum, px). ``highest, base, shape, height, counts, chosen`` are scratch that keeps its size.
+    at half maximum, px). ``highest, light, base, shape, height, counts, chosen`` are scratch that keeps its size.
     """
     rows, columns = image.shape
     row_maxima(image, highest)
-    mean = light_sum(image, top, scale, dark) / (rows * columns)
+    row_light(image, top, scale, dark, light)
+    mean = light.sum() / (rows * columns)
     asked = k * mean
     if ceiling > 0.0:
         of_maxima = np.int64(0)
@@ -287,13 +288,12 @@ def extract_line(  # type: ignore[no-untyped-def]
             of_maxima += grey(highest[r], top, scale, dark)
         asked = min(asked, ceiling * (of_maxima / rows))
     for r in range(rows):
-        threshold = max(asked, floor * grey(highest[r], top, scale, dark))
+        background = light[r] / columns if from_row_mean else 0.0
+        threshold = max(asked, background + floor * (grey(highest[r], top, scale, dark) - background))
         lowest = lowest_code_above(threshold, scale, dark)
         counts[r] = 0
         if min(np.int64(highest[r]), top) >= lowest:
-            counts[r] = row_peaks(
-                image[r], lowest, grain_px, span_px, top, scale, dark, base[r], shape[r], height[r]
-            )
+            counts[r] = row_peaks(image[r], lowest, grain_px, span_px, top, scale, dark, base[r], shape[r], height[r])
     find_line(counts, shape, height, narrowest, widest, gate_px, gate_max_px, longest, chosen)
     for r in range(rows):
         peak_of_row = chosen[r]

@@ -315,7 +315,7 @@ class _Chain:
 
         width = settled.expected_width_px
         self._line = (
-            settled.k, settled.floor, line.ceiling,
+            settled.k, settled.floor, line.floor_from == "row_mean", line.ceiling,
             line.grain_px, np.inf if width is None else line.grain_span * width,
             0.0 if width is None else width / line.width_factor,
             np.inf if width is None else width * line.width_factor,
@@ -323,6 +323,7 @@ class _Chain:
         )  # fmt: skip
         most = columns // 2 + 1
         self._scratch = (
+            np.empty(rows, np.int64),
             np.empty((rows, most, 2), np.int64), np.empty((rows, most, 2)), np.empty((rows, most), np.int64),
             np.empty(rows, np.int64), np.empty(rows, np.int64),
         )  # fmt: skip

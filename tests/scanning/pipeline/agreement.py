@@ -74,6 +74,7 @@ def reference(steps: Steps, header: StackHeader, recipe: Recipe) -> NDArray[np.f
         p=glt.p if glt else 0.5,
         k=line.k if line.k is not None else (1.5 if compressed else 3.0),
         floor=floor,
+        floor_from_row_mean=line.floor_from == "row_mean",
         ceiling=line.ceiling,
         grain=line.grain_px,
         span=width * line.grain_span if width is not None else math.inf,

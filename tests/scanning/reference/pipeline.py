@@ -33,6 +33,7 @@ class Setting:
     p: float = 0.5
     k: float = 3.0
     floor: float = 0.1
+    floor_from_row_mean: bool = True
     ceiling: float = 0.5
     grain: float = 0.0  # px between two grains of one line
     span: float = math.inf  # px, widest base of joined grains
@@ -78,9 +79,7 @@ def grey_images(stack: list[list[NDArray[Any]]], s: Setting) -> list[Array]:
     window = s.window if "sci" in s.order else 1
     for span in windows(len(stack), s):
         codes = [[np.minimum(image.astype(float), s.saturation) for image in stack[i]] for i in span]
-        fused_first = "hdre" in s.order and (
-            "sci" not in s.order or s.order.index("hdre") < s.order.index("sci")
-        )
+        fused_first = "hdre" in s.order and ("sci" not in s.order or s.order.index("hdre") < s.order.index("sci"))
         tone_first = "glt" in s.order and ("sci" not in s.order or s.order.index("glt") < s.order.index("sci"))
         if fused_first or (tone_first and "hdre" not in s.order):
             singles = []
@@ -253,7 +252,10 @@ def profile(image: Array, s: Setting) -> Array:
     asked = s.k * image.mean()
     if s.ceiling > 0:
         asked = min(asked, s.ceiling * maxima.mean())
-    rows = [peaks_of_row(P, max(asked, s.floor * P.max()), s) for P in image]
+    rows = []
+    for P in image:  # noqa: N806
+        background = P.mean() if s.floor_from_row_mean else 0.0
+        rows.append(peaks_of_row(P, max(asked, background + s.floor * (P.max() - background)), s))
     out = np.full(len(rows), np.nan)
     for r, k in enumerate(the_line(rows, s)):
         if k >= 0:
