@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import os
+import struct
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -280,11 +281,21 @@ def save_stack(
 
 
 def _open_file(path: Path) -> h5py.File:
-    try:
+    """Open plainly, or, when the file says that a writer is at work or died, in the single-writer mode.
+
+    The library itself must not be asked: a single-writer reader never returns from a file whose end is missing. So
+    flags and length are read from the head (superblock version 3: flags at 11, end of file at 28, little endian).
+    """
+    with path.open("rb") as file:
+        head = file.read(36)
+    if len(head) < 36 or head[8] != 3:
         return h5py.File(path, "r")
-    except OSError:
-        # A file whose writer died, or is at work, opens only in the single-writer mode it was written in.
-        return h5py.File(path, "r", libver="latest", swmr=True)
+    (end,) = struct.unpack("<Q", head[28:36])
+    size = path.stat().st_size
+    if size < end:
+        raise OSError(f"it is cut off: {size} of {end} bytes")
+    being_written = bool(head[11])
+    return h5py.File(path, "r", libver="latest", swmr=True) if being_written else h5py.File(path, "r")
 
 
 def _whole_steps(frames: Any, crc32: Any, steps: int) -> int:
