@@ -22,7 +22,7 @@ from inspection.models import RangeImage as RangeImageRow
 from inspection.models import Recipe, Recomputation, Scan
 from inspection.services.calibrations import calibration_of
 from inspection.services.recipes import recipe_of
-from inspection.services.results import baseline_for, record_result
+from inspection.services.results import baseline_for, pending_range_file, record_result
 from inspection.states import ScanState
 from scanning import process_stack
 from scanning.errors import BadInput, Fault
@@ -49,11 +49,6 @@ LIMITS: dict[str, Any] = {
     "soft_time_limit": SOFT_LIMIT_S,
     "time_limit": HARD_LIMIT_S,
 }
-
-
-def pending_range_file(scan_id: int) -> Path:
-    """Where the rig worker leaves the range image it has ready when the last frame is in."""
-    return Path(settings.RANGES) / "pending" / f"scan-{scan_id}.npz"
 
 
 @app.task(name="worker.measure", **LIMITS)

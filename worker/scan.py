@@ -26,7 +26,7 @@ from inspection.services.audit import audit
 from inspection.services.calibrations import calibration_of
 from inspection.services.queue import pause_queue_for_fault
 from inspection.services.recipes import recipe_of
-from inspection.services.results import save_range_image
+from inspection.services.results import pending_range_file, save_range_image
 from inspection.services.ring import ring_measure
 from inspection.states import ScanState
 from scanning import optics
@@ -38,7 +38,6 @@ from scanning.rig.protocols import Frame, SensorMode
 from scanning.rig.rig import Rig, open_rig
 from scanning.rig.session import AcquisitionSummary, Order, ScanPlan, acquire
 from scanning.stacks import PART_SUFFIX, StackWriter, open_stack
-from worker.compute import pending_range_file
 from worker.lease import Lease, LeaseLostError
 from worker.live import LiveRangeImage
 from worker.stopping import Watch

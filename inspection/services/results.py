@@ -13,14 +13,13 @@ import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 from django.conf import settings
 from django.db import transaction
 from django.utils import timezone
 
-import scanning.precision
 import scanning.range_image
 import scanning.surface
 from inspection.models import (
@@ -41,6 +40,9 @@ from inspection.services.moves import move
 from inspection.services.schedules import note_inspection_done
 from inspection.services.verdict import Judgement, Value, judge
 from inspection.states import ScanState, Verdict
+
+if TYPE_CHECKING:
+    import scanning.precision
 
 
 def record_result(
@@ -108,6 +110,11 @@ def _write_file(scan: Scan, image: scanning.range_image.RangeImage, now: dt.date
     target = settings.RANGES / place
     save_range_image(image, target)
     return place, hashlib.sha256(target.read_bytes()).hexdigest()
+
+
+def pending_range_file(scan_id: int) -> Path:
+    """Where the rig worker leaves the range image it has ready when the last frame is in."""
+    return Path(settings.RANGES) / "pending" / f"scan-{scan_id}.npz"
 
 
 def save_range_image(image: scanning.range_image.RangeImage, target: Path) -> None:
