@@ -36,10 +36,12 @@ INSTALLED_APPS = [
     "whitenoise.runserver_nostatic",
     "django.contrib.staticfiles",
     "django_htmx",
+    "ninja",  # for its own copy of the API page's scripts: no page may need the internet
     "inspection",
 ]
 MIDDLEWARE = [
     "django.middleware.security.SecurityMiddleware",
+    "inspection.middleware.ContentSecurityPolicy",
     "whitenoise.middleware.WhiteNoiseMiddleware",
     "django.contrib.sessions.middleware.SessionMiddleware",
     "django.middleware.common.CommonMiddleware",
@@ -48,7 +50,9 @@ MIDDLEWARE = [
     "django.contrib.messages.middleware.MessageMiddleware",
     "django.middleware.clickjacking.XFrameOptionsMiddleware",
     "django_htmx.middleware.HtmxMiddleware",
+    "inspection.middleware.RoleGate",
 ]
+CSRF_FAILURE_VIEW = "inspection.views.errors.forged"
 ROOT_URLCONF = "inspection.urls"
 WSGI_APPLICATION = "inspection.wsgi.application"
 TEMPLATES = [
@@ -89,6 +93,9 @@ USE_TZ = True
 TIME_ZONE = os.environ.get("TIME_ZONE", "UTC")
 USE_I18N = True
 LANGUAGE_CODE = "en"
+
+#: Printed at the head of every report.
+PLANT_NAME = os.environ.get("PLANT_NAME", "")
 
 STATIC_URL = "static/"
 STATIC_ROOT = HOME / "static"
