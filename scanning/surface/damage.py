@@ -8,6 +8,8 @@ minimum of 2000 noisy pixels is 14 um deep on a surface without a scratch.
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,19 +18,36 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from scanning.surface.filters import Float32, Mask, Smoothed, dilate, hysteresis, label, sigma_px, smooth
-from scanning.surface.noise import robust_sigma
+from scanning.surface.filters import (
+    EIGHT,
+    Float32,
+    Mask,
+    Smoothed,
+    dilate,
+    gaussian_kernel,
+    hysteresis,
+    label,
+    sigma_px,
+    smooth,
+)
+from scanning.surface.noise import Noise, robust_sigma
 from scanning.surface.settings import InspectionSettings
 from scanning.surface.uncertainty import Budget
 
 Labels = NDArray[np.int32]
 
-#: The lightest smoothing, in pixels: enough to tame single pixels, too little to move a wall.
-LIGHT_PX = 0.8
+#: The lightest smoothing: enough to tame single pixels, too little to move a wall.
+LIGHT_UM = 7.0
 #: A kernel narrower than this many pixels does not smooth: wide pitches get this much.
 LEAST_PX = 0.7
 #: A smoothed value counts only where this share of the kernel was measured.
 LEAST_DENSITY = 0.25
+#: A shallow rim is followed outward in rings this wide, while their mean loss is this many times its uncertainty.
+RING_UM = 15.0
+RING_K = 3.0
+FURTHEST_RING_UM = 150.0
+#: Draws of noise with which the excess of a largest value over the true one is estimated.
+NOISE_DRAWS = 24
 #: Enclosed sound islands up to this many times the least damage area belong to the damage.
 ISLAND_AREAS = 20.0
 
@@ -78,7 +97,9 @@ class Detection:
     count: int
     reach_um: tuple[float, ...]
     depth_image: Smoothed
+    wide_image: Smoothed
     sigma_depth_um: float
+    sigma_wide_um: float
 
 
 def uneven_noise(residual_um: Float32, smoothed_um: Float32, sound: Mask) -> Float32:
@@ -128,7 +149,7 @@ def detect(
         return max(rows, LEAST_PX), max(profiles, LEAST_PX)
 
     exact = sigma_px(settings.small_scale_um, row_pitch_um, profile_pitch_um)
-    light = smooth(lost, valid, (LIGHT_PX, LIGHT_PX))
+    light = smooth(lost, valid, sigma_px(LIGHT_UM, row_pitch_um, profile_pitch_um))
     small = smooth(lost, valid, px(settings.small_scale_um))
     wide = smooth(lost, valid, px(settings.wide_scale_um))
     depth = small if px(settings.small_scale_um) == exact else smooth(lost, valid, exact)
@@ -161,7 +182,7 @@ def detect(
     enough = (sizes * pixel_area >= settings.min_area_um2) & (sizes >= settings.min_pixels)
     enough[0] = False
     if not enough.any():
-        return Detection(np.zeros_like(labels), 0, (), depth, sigma_depth)
+        return Detection(np.zeros_like(labels), 0, (), depth, wide, sigma_depth, sigmas[2])
 
     mask, scale_of = _outline(labels, enough, scales, sigmas, uneven, valid, settings)
     mask = _fill(mask, valid, ISLAND_AREAS * settings.min_area_um2 / pixel_area)
@@ -169,7 +190,7 @@ def detect(
     labels = np.where(mask, joined, 0).astype(np.int32)
     widest = ndimage.maximum(scale_of, labels, index=np.arange(1, count + 1))
     reach = tuple(2.0 * (settings.wide_scale_um if level >= 2 else settings.small_scale_um) for level in widest)
-    return Detection(labels, count, reach, depth, sigma_depth)
+    return Detection(labels, count, reach, depth, wide, sigma_depth, sigmas[2])
 
 
 def _outline(
@@ -216,6 +237,43 @@ def _fill(mask: Mask, valid: Mask, island_px: float) -> Mask:
     sound_area = np.bincount(labels[valid], minlength=count)
     inside &= sound_area <= island_px
     return np.asarray(mask | inside[labels])
+
+
+def follow_rims(
+    detection: Detection,
+    lost_um: Float32,
+    valid: Mask,
+    noise: Noise,
+    row_pitch_um: float,
+    profile_pitch_um: float,
+) -> Detection:
+    """Widen each mask, ring by ring, while the ring as a whole is still certainly below the reference.
+
+    The outline of a wide shallow pit ends where single smoothed pixels drown in noise, well inside its true rim; up
+    to a fifth of its volume lies outside. A ring of a thousand pixels sees twenty times less.
+    """
+    labels = detection.labels.copy()
+    for number, place in enumerate(ndimage.find_objects(detection.labels), start=1):
+        if place is None:
+            continue
+        crop = _widen(place, FURTHEST_RING_UM, row_pitch_um, profile_pitch_um, labels.shape)
+        mask = detection.labels[crop] == number
+        distance = ndimage.distance_transform_edt(~mask, sampling=(row_pitch_um, profile_pitch_um))
+        free = (labels[crop] == 0) | mask
+        inner = 0.0
+        while inner < FURTHEST_RING_UM:
+            ring = (distance > inner) & (distance <= inner + RING_UM) & free
+            heights = lost_um[crop][ring & valid[crop]]
+            if heights.size < 5:
+                break
+            chance = np.hypot(noise.sigma_um * np.sqrt(noise.kappa / heights.size), noise.shape_um)
+            if float(heights.mean(dtype=np.float64)) <= RING_K * chance:
+                break
+            inner += RING_UM
+        if inner > 0.0:
+            grown = (distance <= inner) & free & (valid[crop] | mask)
+            labels[crop][grown] = number
+    return dataclasses.replace(detection, labels=labels)
 
 
 def owners(detection: Detection, row_pitch_um: float, profile_pitch_um: float) -> Labels:
@@ -269,6 +327,7 @@ def findings(
     """
     pixel_area = row_pitch_um * profile_pitch_um
     lost = -residual_um
+    detection = follow_rims(detection, lost, valid, budget.noise, row_pitch_um, profile_pitch_um)
     owner = owners(detection, row_pitch_um, profile_pitch_um)
     open_pixels = lost_at_edge(valid, expected)
     places = ndimage.find_objects(detection.labels)
@@ -294,14 +353,15 @@ def findings(
         whole = mask | enclosed | at_edge
 
         lower = float(lost[crop][measured].sum(dtype=np.float64)) * pixel_area * 1e-9
-        filled = _interpolated(depth, density, enclosed, mask)
-        extended = _interpolated(depth, density, at_edge, mask)
-        filled_mm3, open_mm3 = (value * pixel_area * 1e-9 for value in (filled, extended))
-        # Undefined pixels in the widened rim lie where the loss is next to nothing; they join what was measured.
-        rim = missing & around & ~enclosed & ~at_edge
-        filled_mm3 += _interpolated(depth, density, rim, mask) * pixel_area * 1e-9
-        volume = lower + filled_mm3
-        u_volume = budget.volume_mm3(volume, int(np.count_nonzero(measured)), pixel_area, filled_mm3)
+        # Undefined pixels in the widened rim are filled like enclosed ones: leaving them out would count them as sound.
+        holes = enclosed | (missing & around & ~at_edge)
+        filled, u_filled = _interpolated(depth, density, holes, mask, lost[crop], valid[crop])
+        extended, _ = _interpolated(depth, density, at_edge, mask, lost[crop], valid[crop])
+        volume = lower + filled * pixel_area * 1e-9
+        open_mm3 = extended * pixel_area * 1e-9
+        u_volume = budget.volume_mm3(
+            volume, int(np.count_nonzero(measured)), pixel_area, u_filled * pixel_area * 1e-9
+        )
 
         judged = mask & valid[crop] & (density >= LEAST_DENSITY)
         if not judged.any():
@@ -309,8 +369,17 @@ def findings(
         flat = np.where(judged, depth, -np.inf)
         deepest = np.unravel_index(int(np.argmax(flat)), flat.shape)
         depth_um = float(flat[deepest])
-        spread = float(detection.depth_image.spread[crop][deepest])
-        u_depth = budget.depth_um(depth_um, detection.sigma_depth_um * spread)
+        sigma_here = detection.sigma_depth_um * float(detection.depth_image.spread[crop][deepest])
+        excess = excess_of_largest(
+            np.where(judged, detection.wide_image.value[crop], np.float32(np.nan)),
+            detection.sigma_wide_um,
+            sigma_here,
+            math.hypot(settings.small_scale_um, noise_reach_um(budget.noise, pixel_area)),
+            row_pitch_um,
+            profile_pitch_um,
+        )
+        depth_um = max(depth_um - excess, 0.0)
+        u_depth = budget.depth_um(depth_um, math.hypot(sigma_here, 0.3 * excess))
 
         rows_at, profiles_at = np.nonzero(whole)
         row_range = (int(rows_at.min()) + crop[0].start, int(rows_at.max()) + crop[0].start + 1)
@@ -386,17 +455,83 @@ def _undefined_of(mask: Mask, missing: Mask) -> Mask:
     return mine[labels]
 
 
-def _interpolated(depth: Float32, density: Float32, where: Mask, mask: Mask) -> float:
-    """Sum of depths over undefined pixels, from the smoothed surroundings; the mask's median where none reaches."""
+def _interpolated(
+    depth: Float32, density: Float32, where: Mask, mask: Mask, lost: Float32, valid: Mask
+) -> tuple[float, float]:
+    """Sum of depths over undefined pixels, and its standard uncertainty, both in um times pixels.
+
+    Taken from the smoothed surroundings, or the mask's median where they do not reach. Each undefined pixel may lie
+    anywhere between the lowest and the highest of its measured 3 x 3 surroundings; within one connected hole these
+    errors go together.
+    """
     if not where.any():
-        return 0.0
+        return 0.0, 0.0
     near = where & (density > 0.02)
     total = float(depth[near].sum(dtype=np.float64))
-    far = int(np.count_nonzero(where & ~near))
-    if far:
-        inside = depth[mask & np.isfinite(depth)]
-        total += far * (float(np.median(inside)) if inside.size else 0.0)
-    return total
+    far = where & ~near
+    inside = depth[mask & np.isfinite(depth)]
+    if far.any():
+        total += np.count_nonzero(far) * (float(np.median(inside)) if inside.size else 0.0)
+    big = np.float32(1e9)
+    highest = cv2.dilate(np.where(valid, lost, -big), EIGHT)
+    lowest = cv2.erode(np.where(valid, lost, big), EIGHT)
+    half = np.where(highest > lowest, 0.5 * (highest - lowest), np.float32(inside.max() / 2.0 if inside.size else 0.0))
+    labels, count = label(where)
+    per_hole = np.bincount(labels[where], weights=half[where].astype(np.float64), minlength=count + 1)
+    return total, float(np.sqrt(np.sum(per_hole**2) / 3.0))
+
+
+def noise_reach_um(noise: Noise, pixel_area_um2: float) -> float:
+    """Standard deviation of the Gaussian kernel that would give white noise the measured kappa."""
+    return math.sqrt(noise.kappa * pixel_area_um2 / (4.0 * math.pi))
+
+
+def excess_of_largest(
+    shape_um: Float32,
+    sigma_shape_um: float,
+    sigma_um: float,
+    reach_um: float,
+    row_pitch_um: float,
+    profile_pitch_um: float,
+) -> float:
+    """How far the largest value of a noisy surface exceeds the largest of the surface itself, on average, in um.
+
+    The deepest of many noisy pixels is too deep: by 1.5 standard deviations on the flat floor of a wide pit, hardly
+    at all at the tip of a cone. The same noise (standard deviation ``sigma_um``, Gaussian correlation of ``reach_um``)
+    is laid over the more strongly smoothed ``shape_um`` (NaN outside the damage) 24 times and the excess averaged.
+    What of that shape lies within 1.5 of its own standard deviations ``sigma_shape_um`` of its top is taken as flat.
+    The seed is fixed: the same damage must get the same depth every time.
+    """
+    top = float(np.nanmax(shape_um)) if np.isfinite(shape_um).any() else float("nan")
+    if not (math.isfinite(top) and sigma_um > 0.0):
+        return 0.0
+    top -= 1.5 * sigma_shape_um
+    shape_um = np.minimum(shape_um, np.float32(top))
+    near = np.isfinite(shape_um) & (shape_um > top - 5.0 * sigma_um)
+    rows, profiles = np.nonzero(near)
+    core = shape_um[rows.min() : rows.max() + 1, profiles.min() : profiles.max() + 1]
+    inside = near[rows.min() : rows.max() + 1, profiles.min() : profiles.max() + 1]
+    # A floor of millions of pixels needs no finer grid than the noise itself has.
+    stride = tuple(max(1, int(0.5 * reach_um / pitch)) for pitch in (row_pitch_um, profile_pitch_um))
+    core, inside = core[:: stride[0], :: stride[1]], inside[:: stride[0], :: stride[1]]
+    if not inside.any():
+        return 0.0
+    kernel = tuple(
+        gaussian_kernel(reach_um / (pitch * step))
+        for pitch, step in zip((row_pitch_um, profile_pitch_um), stride, strict=True)
+    )
+    margin = (kernel[0].size // 2, kernel[1].size // 2)
+    rng = np.random.default_rng(20170925)
+    largest = np.empty(NOISE_DRAWS)
+    scale = sigma_um / math.sqrt(float(np.sum(kernel[0] ** 2)) * float(np.sum(kernel[1] ** 2)))
+    for draw in range(NOISE_DRAWS):
+        white = rng.standard_normal(
+            (core.shape[0] + 2 * margin[0], core.shape[1] + 2 * margin[1]), dtype=np.float32
+        )
+        noise = cv2.sepFilter2D(white, cv2.CV_32F, kernel[1], kernel[0])
+        noise = noise[margin[0] : margin[0] + core.shape[0], margin[1] : margin[1] + core.shape[1]] * scale
+        largest[draw] = float((core + noise)[inside].max())
+    return max(0.0, float(largest.mean()) - top)
 
 
 def _runs(mask: Mask, first_row: int, first_profile: int) -> tuple[tuple[int, int, int], ...]:

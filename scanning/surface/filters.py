@@ -82,15 +82,19 @@ def sigma_px(sigma_um: float, row_pitch_um: float, profile_pitch_um: float) -> t
 
 
 def ellipse(reach_um: float, row_pitch_um: float, profile_pitch_um: float) -> NDArray[np.uint8]:
-    """Structuring element of all pixels whose centre lies within ``reach_um`` of its own centre."""
-    half_rows, half_profiles = int(reach_um / row_pitch_um), int(reach_um / profile_pitch_um)
-    rows = np.arange(-half_rows, half_rows + 1)[:, None] * row_pitch_um
-    profiles = np.arange(-half_profiles, half_profiles + 1)[None, :] * profile_pitch_um
-    return (rows**2 + profiles**2 <= reach_um**2 * (1 + 1e-9)).astype(np.uint8)
+    """Structuring element of all pixels whose centre lies within ``reach_um`` of its own, one pixel at least."""
+    half_rows, half_profiles = max(reach_um, row_pitch_um), max(reach_um, profile_pitch_um)
+    rows = np.arange(-int(half_rows / row_pitch_um), int(half_rows / row_pitch_um) + 1) * row_pitch_um / half_rows
+    profiles = np.arange(-int(half_profiles / profile_pitch_um), int(half_profiles / profile_pitch_um) + 1)
+    profiles = profiles * profile_pitch_um / half_profiles
+    return (rows[:, None] ** 2 + profiles[None, :] ** 2 <= 1.0 + 1e-9).astype(np.uint8)
 
 
 def dilate(mask: Mask, reach_um: float, row_pitch_um: float, profile_pitch_um: float) -> Mask:
-    """Grow a mask by a distance in micrometres, the same in every direction whatever the pitches."""
+    """Grow a mask by a distance in micrometres (and one pixel at least), whatever the pitches.
+
+    The pixel next to a wall is partly wall: with a pitch wider than the distance it would be left out.
+    """
     element = ellipse(reach_um, row_pitch_um, profile_pitch_um)
     return np.asarray(cv2.dilate(mask.astype(np.uint8), element, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0)
 

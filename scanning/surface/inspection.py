@@ -264,6 +264,17 @@ def _inspect(
     missing = detect(residual, valid, row_pitch, profile_pitch, settings, sign=-1)
     raised = detect(residual, valid, row_pitch, profile_pitch, settings, sign=+1)
     touched = (missing.labels > 0) | (raised.labels > 0)
+    if touched.any():
+        # Damage shallower than the fit's tolerance has pulled the reference a little towards itself: fit once more
+        # without it, and look again.
+        calm = valid & ~dilate(touched, 2.0 * settings.wide_scale_um, row_pitch, profile_pitch)
+        if np.count_nonzero(calm) > max(1000, 0.2 * np.count_nonzero(valid)):
+            again = fit_plane(residual, row_pitch, profile_pitch, form=settings.form, use=calm)
+            residual = residual - again.height_um()
+            plane = plane.shifted(again)
+            missing = detect(residual, valid, row_pitch, profile_pitch, settings, sign=-1)
+            raised = detect(residual, valid, row_pitch, profile_pitch, settings, sign=+1)
+            touched = (missing.labels > 0) | (raised.labels > 0)
     sound = valid & ~dilate(touched, 2.0 * settings.wide_scale_um, row_pitch, profile_pitch)
     if np.count_nonzero(sound) < max(200, 0.05 * np.count_nonzero(valid)):
         sound = valid & ~touched

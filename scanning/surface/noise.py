@@ -102,8 +102,9 @@ def measure_noise(residual_um: Float32, sound: Mask, row_pitch_um: float, profil
     if np.count_nonzero(mask) < 200:
         patch, mask = residual_um, sound
     span_um = min(patch.shape[0] * row_pitch_um, patch.shape[1] * profile_pitch_um)
-    if span_um > 3 * SHAPE_SIGMA_UM:
-        patch = patch - smooth(patch, mask, sigma_px(SHAPE_SIGMA_UM, row_pitch_um, profile_pitch_um)).value
+    shape_sigma_um = max(SHAPE_SIGMA_UM, 12.0 * max(row_pitch_um, profile_pitch_um))
+    if span_um > 3 * shape_sigma_um:
+        patch = patch - smooth(patch, mask, sigma_px(shape_sigma_um, row_pitch_um, profile_pitch_um)).value
     limit = np.float32(5.0 * sigma)
     patch = np.clip(np.nan_to_num(patch, nan=0.0), -limit, limit).astype(np.float32)
     patch = patch - np.float32(patch[mask].mean(dtype=np.float64))
@@ -112,9 +113,10 @@ def measure_noise(residual_um: Float32, sound: Mask, row_pitch_um: float, profil
         min(max(2, round(REACH_PROFILES_UM / profile_pitch_um)), 24, patch.shape[1] // 4),
     )
     rho = autocorrelation(patch, mask, reach)
-    # Lags along negative rows mirror those along positive rows: count every row but the first twice.
-    kappa = float(rho[0].sum() + 2.0 * rho[1:].sum())
-    kappa = float(np.clip(kappa, 1.0, rho.size * 2.0))
+    # A lag whose correlation cannot be told from chance (2 / sqrt n) would only add its own scatter, and there are
+    # hundreds: on a small image their sum would be anything. Lags along negative rows mirror those along positive.
+    certain = np.where(np.abs(rho) > 2.0 / np.sqrt(np.count_nonzero(mask)), rho, 0.0)
+    kappa = max(1.0, float(certain[0].sum() + 2.0 * certain[1:].sum()))
     shape_um = _shape(residual_um, sound, row_pitch_um, profile_pitch_um, sigma**2 * kappa)
     return Noise(
         sigma_um=sigma,

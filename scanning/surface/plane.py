@@ -7,6 +7,7 @@ capture it, and says how much of the surface agrees. Below half it refuses: then
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Literal
 
@@ -62,6 +63,17 @@ class Plane:
             yy, xy, xx = self.quadratic
             height = height + yy * y[:, None] ** 2 + xy * y[:, None] * x[None, :] + xx * x[None, :] ** 2
         return height.astype(np.float32)
+
+    def shifted(self, correction: Plane) -> Plane:
+        """Return this reference plus the one fitted to what it left over."""
+        return dataclasses.replace(
+            self,
+            offset_um=self.offset_um + correction.offset_um,
+            slope_rows_um_per_mm=self.slope_rows_um_per_mm + correction.slope_rows_um_per_mm,
+            slope_profiles_um_per_mm=self.slope_profiles_um_per_mm + correction.slope_profiles_um_per_mm,
+            quadratic=tuple(a + b for a, b in zip(self.quadratic, correction.quadratic, strict=True)),
+            sigma_um=correction.sigma_um,
+        )
 
     @property
     def area_factor(self) -> float:

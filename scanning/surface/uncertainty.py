@@ -40,19 +40,18 @@ class Budget:
     pitch: float | None
     sentence: str
 
-    def volume_mm3(self, volume_mm3: float, pixels: int, pixel_area_um2: float, filled_mm3: float = 0.0) -> float:
+    def volume_mm3(self, volume_mm3: float, pixels: int, pixel_area_um2: float, u_filled_mm3: float = 0.0) -> float:
         """u(V): noise over the mask, reference over its area, scale and pitch over the volume.
 
-        u^2 = (a sigma)^2 N kappa + (A u_ref)^2 + (V u_S/S)^2 + (V u_dx/dx)^2, and for ``filled_mm3`` interpolated
-        over undefined pixels a rectangular half width of half of it.
+        u^2 = (a sigma)^2 N kappa + (A u_ref)^2 + (V u_S/S)^2 + (V u_dx/dx)^2 + u_filled^2, the last for what was
+        interpolated over undefined pixels.
         """
         noise = pixel_area_um2 * self.noise.sigma_um * math.sqrt(max(pixels, 0) * self.noise.kappa) * 1e-9
         reference = pixel_area_um2 * pixels * self.reference_um * 1e-9
         scale = volume_mm3 * (self.scale or 0.0)
         # Both pitches come from one magnification as a rule: an area is then twice as uncertain as a length.
         pitch = volume_mm3 * 2.0 * (self.pitch or 0.0)
-        filled = 0.5 * filled_mm3 / math.sqrt(3.0)
-        return math.sqrt(noise**2 + reference**2 + scale**2 + pitch**2 + filled**2)
+        return math.sqrt(noise**2 + reference**2 + scale**2 + pitch**2 + u_filled_mm3**2)
 
     def depth_um(self, depth_um: float, sigma_smoothed_um: float) -> float:
         """u(d) = sqrt(sigma_g^2 + u_ref^2 + (d u_S/S)^2 + u_lin^2)."""
