@@ -26,7 +26,7 @@ from inspection.services.results import baseline_for, pending_range_file, record
 from inspection.states import ScanState
 from scanning import process_stack
 from scanning.errors import BadInput, Fault
-from scanning.precision import measure_precision
+from scanning.precision import FlatRegion, precision_of
 from scanning.range_image import RangeImage
 from scanning.stacks import open_stack
 from scanning.surface import InspectionSettings, inspect_surface
@@ -159,10 +159,7 @@ def compute(
         )
     except Fault as fault:
         doubts.append(str(fault))
-    plan = scan.plan
-    precision = measure_precision(
-        image, flat_rows=(int(plan["flat_row"]), int(plan["flat_row"]) + int(plan["flat_rows"]))
-    )
+    precision = precision_of(image, flat_of(scan, image))
     if lease is not None:
         lease.renew()
         lease.check()
@@ -179,6 +176,13 @@ def compute(
     if recomputation is None:
         pending.unlink(missing_ok=True)
     return result
+
+
+def flat_of(scan: Scan, image: RangeImage) -> FlatRegion | None:
+    """The region's flat part as it was ordered, over all profiles; None (it is then looked for) if it is not there."""
+    first = int(scan.plan["flat_row"])
+    last = min(first + int(scan.plan["flat_rows"]), image.height_um.shape[0])
+    return FlatRegion(first, last, 0, image.height_um.shape[1], "the region's") if last - first >= 3 else None
 
 
 def _from_frames(scan: Scan, recipe: Recipe, lease: Lease | None) -> RangeImage:

@@ -55,14 +55,16 @@ def record_result(
     baseline: RangeImage | None = None,
     doubts: Sequence[str] = (),
     recomputation: Recomputation | None = None,
+    at: dt.datetime | None = None,
 ) -> RangeImage | None:
     """Store a scan's result and move it to done; None if somebody else had already stored one.
 
     ``report`` is None when the surface could not be measured; ``doubts`` then says why, and the verdict is unknown.
-    With ``recomputation`` the result is added beside the earlier ones and the scan's state stays.
+    With ``recomputation`` the result is added beside the earlier ones and the scan's state stays. ``at`` is when it was
+    measured, for results of another day; default now.
     """
     recipe = recipe or scan.recipe
-    now = timezone.now()
+    now = at or timezone.now()
     place, sha256 = _write_file(scan, image, now)
     try:
         with transaction.atomic():
@@ -118,16 +120,10 @@ def pending_range_file(scan_id: int) -> Path:
 
 
 def save_range_image(image: scanning.range_image.RangeImage, target: Path) -> None:
-    """Write the npz under a temporary name, force it to the disk, then give it its name."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(f".{target.stem}.writing.npz")
-    try:
-        image.save(partial)
-        with partial.open("rb") as written:
-            os.fsync(written.fileno())
-        partial.replace(target)
-    finally:
-        partial.unlink(missing_ok=True)
+    """Write the npz whole, and force it to the disk before any row may name it."""
+    image.save(target)
+    with target.open("rb") as written:
+        os.fsync(written.fileno())
 
 
 def _add_rows(
@@ -254,11 +250,13 @@ def _add_damages(row: RangeImage, report: scanning.surface.SurfaceReport) -> Non
 
 def _add_precision(row: RangeImage, precision: scanning.precision.PrecisionReport) -> None:
     cell_scan_um, cell_row_um = precision.lateral_cell_um
+    if precision.ns_per_range_pixel is None:
+        raise ValueError("the range image was not timed")
     PrecisionReport.objects.create(
         range_image=row,
-        undefined_count=precision.undefined_count,
+        undefined_count=precision.undefined,
         undefined_share=precision.undefined_share,
-        saturated_count=precision.saturated_count,
+        saturated_count=precision.saturated,
         saturated_share=precision.saturated_share,
         sigma_um=_finite(precision.sigma_um),
         cell_scan_um=cell_scan_um,

@@ -76,7 +76,7 @@ def test_nothing_is_claimed_from_a_queue_that_must_not_run(three: list[Scan], ri
 @pytest.mark.django_db(transaction=True)
 def test_many_claims_at_the_same_moment_have_one_winner(tool: Tool, rig: Rig, olga: User) -> None:
     queue.enqueue_inspection(tool=tool, rig=rig, by=olga)
-    start = threading.Barrier(8)
+    start = threading.Barrier(4)
     won: list[Lease] = []
 
     def race() -> None:
@@ -87,7 +87,7 @@ def test_many_claims_at_the_same_moment_have_one_winner(tool: Tool, rig: Rig, ol
         finally:
             connection.close()
 
-    threads = [threading.Thread(target=race) for _ in range(8)]
+    threads = [threading.Thread(target=race) for _ in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
