@@ -6,11 +6,18 @@ one object is what stops a number from travelling without its origin.
 
 from __future__ import annotations
 
+import json
+import math
+import zipfile
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from scanning.errors import BadInput
+from scanning.whole_file import whole_file
 
 Float32 = NDArray[np.float32]
 
@@ -51,3 +58,96 @@ class RangeImage:
     @property
     def saturated_share(self) -> float:
         return self.saturated / self.frame_pixels if self.frame_pixels else 0.0
+
+    def save(self, path: Path | str) -> None:
+        """Write ``range.npz`` (contract 3): the arrays as float32, both pitches, counts, and provenance as JSON text.
+
+        The file appears whole or not at all.
+        """
+        with whole_file(path) as part, part.open("wb") as file:
+            np.savez(
+                file,
+                column_px=self.column_px.astype(np.float32, copy=False),
+                height_um=self.height_um.astype(np.float32, copy=False),
+                row_pitch_um=np.float64(self.row_pitch_um),
+                profile_pitch_um=np.float64(self.profile_pitch_um),
+                intensity=self.intensity.astype(np.float32, copy=False),
+                width_px=self.width_px.astype(np.float32, copy=False),
+                saturated=np.int64(self.saturated),
+                frame_pixels=np.int64(self.frame_pixels),
+                wall_s=np.float64(self.wall_s),
+                cpu_s=np.float64(self.cpu_s),
+                provenance=np.str_(json.dumps(self.provenance, allow_nan=False)),
+            )
+
+    @staticmethod
+    def load(path: Path | str) -> RangeImage:
+        """Read what `save` wrote, or a foreign .npz with ``height_um``, ``row_pitch_um`` and ``profile_pitch_um``.
+
+        Channels that are not there become NaN; infinite heights become NaN. Raises `BadInput` naming file and fault.
+        """
+        place = Path(path)
+        try:
+            with np.load(place, allow_pickle=False) as stored:
+                if not isinstance(stored, np.lib.npyio.NpzFile):
+                    raise ValueError("it holds a single array")
+                held = {name: stored[name] for name in stored.files}
+        except FileNotFoundError:
+            raise BadInput(f"there is no range image at {place}; process a stack first") from None
+        except (OSError, ValueError, EOFError, KeyError, AttributeError, zipfile.BadZipFile) as error:
+            raise BadInput(f"{place} is not a range image or is damaged ({error}); process the stack again") from error
+        for name in ("height_um", "row_pitch_um", "profile_pitch_um"):
+            if name not in held:
+                raise BadInput(f"{place} has no {name}; it is not a range image of `python -m scanning process`")
+        height = _heights(held["height_um"], place)
+        return RangeImage(
+            column_px=_channel(held, "column_px", height, place),
+            height_um=height,
+            row_pitch_um=_pitch(held["row_pitch_um"], "row_pitch_um", place),
+            profile_pitch_um=_pitch(held["profile_pitch_um"], "profile_pitch_um", place),
+            intensity=_channel(held, "intensity", height, place),
+            width_px=_channel(held, "width_px", height, place),
+            saturated=int(held.get("saturated", 0)),
+            frame_pixels=int(held.get("frame_pixels", 0)),
+            wall_s=float(held.get("wall_s", 0.0)),
+            cpu_s=float(held.get("cpu_s", 0.0)),
+            provenance=_provenance(held, place),
+        )
+
+
+def _heights(stored: NDArray[Any], place: Path) -> Float32:
+    if stored.ndim != 2 or stored.dtype.kind not in "fiu" or stored.size == 0:
+        raise BadInput(
+            f"{place}: height_um is {stored.dtype} of shape {stored.shape}; it must be (rows, profiles) numbers"
+        )
+    height = stored.astype(np.float32)
+    height[~np.isfinite(height)] = np.nan
+    return height
+
+
+def _channel(held: dict[str, NDArray[Any]], name: str, height: Float32, place: Path) -> Float32:
+    stored = held.get(name)
+    if stored is None:
+        return np.full_like(height, np.nan)
+    if stored.shape != height.shape or stored.dtype.kind not in "fiu":
+        raise BadInput(f"{place}: {name} is {stored.dtype} of shape {stored.shape}, but height_um is {height.shape}")
+    return stored.astype(np.float32, copy=False)
+
+
+def _pitch(stored: NDArray[Any], name: str, place: Path) -> float:
+    pitch = float(stored) if stored.size == 1 and stored.dtype.kind in "fiu" else math.nan
+    if not (math.isfinite(pitch) and pitch > 0):
+        raise BadInput(f"{place}: {name} must be one number of micrometres greater than zero; process the stack again")
+    return pitch
+
+
+def _provenance(held: dict[str, NDArray[Any]], place: Path) -> dict[str, Any]:
+    if "provenance" not in held:
+        return {"origin": place.name}
+    try:
+        told = json.loads(str(held["provenance"]))
+    except json.JSONDecodeError:
+        raise BadInput(f"{place}: its provenance is not JSON; process the stack again") from None
+    if not isinstance(told, dict):
+        raise BadInput(f"{place}: its provenance is not a JSON object; process the stack again")
+    return told
