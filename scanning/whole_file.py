@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from scanning.errors import BadInput
@@ -32,4 +32,5 @@ def whole_file(path: Path | str) -> Iterator[Path]:
             f"{place} cannot be written ({error.strerror or error}); check the folder and the disk"
         ) from error
     finally:
-        part.unlink(missing_ok=True)
+        with suppress(OSError):
+            part.unlink(missing_ok=True)

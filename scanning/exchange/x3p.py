@@ -88,12 +88,10 @@ def read_x3p(path: Path | str, *, verify: bool = True) -> RangeImage:
             )
     # The height of a point is Increment x stored + Offset; the layer leaves the offset out.
     height = layer.z / UM + float(file.placement.offset[2]) / UM
-    missing_as_infinity = int(np.count_nonzero(np.isinf(height)))
+    # Some programs write missing points as infinity.
     height_um = np.where(np.isfinite(height), height, np.nan).astype(np.float32)
     unknown = np.full_like(height_um, np.nan)
     notes = []
-    if missing_as_infinity:
-        notes.append(f"{missing_as_infinity} infinite heights were read as not measured.")
     if not verify:
         notes.append("The checksums were not verified.")
     provenance: dict[str, Any] = {"origin": place.name, "format": "X3P", "revision": str(file.revision), "notes": notes}
