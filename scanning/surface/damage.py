@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, stats
 
 from scanning.surface.filters import (
     EIGHT,
@@ -42,9 +42,12 @@ LIGHT_UM = 7.0
 LEAST_PX = 0.7
 #: A smoothed value counts only where this share of the kernel was measured.
 LEAST_DENSITY = 0.25
+#: Chance of a false alarm per image and scale; a larger image has more places where noise can look like damage.
+FALSE_ALARMS = 0.001
 #: A shallow rim is followed outward in rings this wide, while their mean loss is this many times its uncertainty.
 RING_UM = 15.0
 RING_K = 3.0
+RING_SHARE = 0.05
 FURTHEST_RING_UM = 150.0
 #: Draws of noise with which the excess of a largest value over the true one is estimated.
 NOISE_DRAWS = 24
@@ -164,12 +167,16 @@ def detect(
         field = [sound & (image.density > 0.6) for image in scales]
         sigmas = [robust_sigma(image.value[use]) for image, use in zip(scales, field, strict=True)]
         found = np.zeros_like(valid)
-        for image, sigma in zip(scales[1:], sigmas[1:], strict=True):
+        for image, sigma, scale_um in zip(
+            scales[1:], sigmas[1:], (settings.small_scale_um, settings.wide_scale_um), strict=True
+        ):
             if not np.isfinite(sigma):
                 continue
+            kernel_px = 4.0 * math.pi * px(scale_um)[0] * px(scale_um)[1]
+            seed_k = max(settings.seed_k, float(stats.norm.isf(FALSE_ALARMS * kernel_px / valid.size)))
             unit = np.maximum(sigma * image.spread * uneven, settings.least_depth_um / settings.grow_k)
             ratio = np.where(valid & (image.density >= LEAST_DENSITY), image.value / unit, np.float32(0.0))
-            found |= hysteresis(ratio > settings.seed_k, ratio > settings.grow_k)
+            found |= hysteresis(ratio > seed_k, ratio > settings.grow_k)
         if not found.any():
             break
         sound = valid & ~dilate(found, settings.wide_scale_um, row_pitch_um, profile_pitch_um)
@@ -260,6 +267,7 @@ def follow_rims(
         mask = detection.labels[crop] == number
         distance = ndimage.distance_transform_edt(~mask, sampling=(row_pitch_um, profile_pitch_um))
         free = (labels[crop] == 0) | mask
+        deepest = float(np.nanmax(np.where(mask, detection.depth_image.value[crop], np.float32(0.0))))
         inner = 0.0
         while inner < FURTHEST_RING_UM:
             ring = (distance > inner) & (distance <= inner + RING_UM) & free
@@ -267,7 +275,8 @@ def follow_rims(
             if heights.size < 5:
                 break
             chance = np.hypot(noise.sigma_um * np.sqrt(noise.kappa / heights.size), noise.shape_um)
-            if float(heights.mean(dtype=np.float64)) <= RING_K * chance:
+            # A steep wall needs no following: what blurring leaves beyond it is a few per cent of the depth.
+            if float(heights.mean(dtype=np.float64)) <= max(RING_K * chance, RING_SHARE * deepest):
                 break
             inner += RING_UM
         if inner > 0.0:

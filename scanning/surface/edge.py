@@ -30,7 +30,8 @@ class Edge:
     """The edge of one region; one entry per profile, NaN where none was found.
 
     ``row`` is the last sound row (sub-pixel), ``reference_row`` the line through the undamaged edge, ``recession_um``
-    the distance between them, positive where material is gone. ``side`` says at which end of the rows the edge is.
+    the distance between them, positive where material is gone. ``outermost_row`` is the line where the light ends: a
+    rounded edge or the floor of a chip is still seen there. ``undamaged`` marks profiles whose edge is on the line. ``side`` says at which end of the rows the edge is.
     ``sigma_um`` is the scatter of single edge points about the line; ``rounded_um`` the distance from the edge at
     which the surface meets the bevel again, 0 when it is sharp to the last row.
     """
@@ -38,6 +39,8 @@ class Edge:
     side: Literal["first", "last"]
     row: Float64
     reference_row: Float64
+    outermost_row: Float64
+    undamaged: Mask
     recession_um: Float64
     straightness_um: float
     sigma_um: float
@@ -96,29 +99,39 @@ def find_edge(
         chosen = "first" if "first" in ends else "last"
 
     flip = chosen == "first"
+    seen = valid & (ndimage.uniform_filter(valid.astype(np.float32), size=(5, 3), mode="nearest") >= 0.5)
     row = _last_row(body[::-1] if flip else body, (light.value[::-1] if flip else light.value), limit)
+    outline = (valid.shape[0] - 1 - _band(seen, chosen)).astype(np.float64) + 0.5
     height = residual_um.shape[0]
-    line = _line(row, np.arange(row.size, dtype=np.float64), profile_pitch_um)
+    line = _reference(row, outline)
     if line is None:
         remarks.append("Too few edge points for an edge line; edge recession is not reported.")
         return None, remarks
     own_line = line
+    outermost = np.fmax(line, _fitted(outline, 75.0)) if np.isfinite(outline).any() else line
     if reference_row is not None:
         line = (height - 1 - reference_row) if flip else reference_row
     recession = (line - row) * row_pitch_um
     window = max(1, round(ALONG_UM / profile_pitch_um)) | 1
     steady = _running_median(recession, window)
     scatter = (row - own_line) * row_pitch_um
-    sigma_edge = robust_sigma(scatter)
+    sigma_edge = _point_scatter(row) * row_pitch_um
+    undamaged = np.abs(scatter) < max(4.0 * sigma_edge, 3.0 * row_pitch_um)
     rolled = _running_median(scatter, window)
     straightness = float(np.nanmax(rolled) - np.nanmin(rolled))
     rounded = _rounded(
-        residual_um[::-1] if flip else residual_um, valid[::-1] if flip else valid, own_line, row_pitch_um, sigma
+        (residual_um[::-1] if flip else residual_um)[:, undamaged],
+        (valid[::-1] if flip else valid)[:, undamaged],
+        outermost[undamaged],
+        row_pitch_um,
+        sigma,
     )
     edge = Edge(
         side=chosen,
         row=(height - 1 - row) if flip else row,
         reference_row=(height - 1 - line) if flip else line,
+        outermost_row=(height - 1 - outermost) if flip else outermost,
+        undamaged=undamaged,
         recession_um=steady,
         straightness_um=straightness,
         sigma_um=sigma_edge,
@@ -129,11 +142,11 @@ def find_edge(
 
 
 def expected_surface(edge: Edge, rows: int) -> Mask:
-    """Pixels on the bevel's side of the reference edge line, one row of margin beyond it."""
+    """Pixels on the bevel's side of the reference edge line, or of the end of the light where that is further out."""
     index = np.arange(rows)[:, None]
     if edge.side == "last":
-        return np.asarray(index <= edge.reference_row[None, :] + 1.0)
-    return np.asarray(index >= edge.reference_row[None, :] - 1.0)
+        return np.asarray(index <= np.fmax(edge.reference_row, edge.outermost_row)[None, :])
+    return np.asarray(index >= np.fmin(edge.reference_row, edge.outermost_row)[None, :])
 
 
 def distance_to_edge_um(edge: Edge, rows: int, row_pitch_um: float) -> Float32:
@@ -151,22 +164,24 @@ def roll_off(
 
     A rounded edge is wear, measured by ``rounded_um`` and the recession; left in, it would appear as one damage as
     long as the tool. The median over all profiles at each distance from the edge line knows nothing of single chips.
-    Only distances whose median is certain (5 standard uncertainties) are used, outward from the innermost such
-    stretch; where fewer than half of the profiles are measured nothing is corrected.
+    Only profiles with an undamaged edge vote, and only distances whose median is certain (5 standard uncertainties)
+    are used, in one stretch from the edge inward; where fewer than half of them are measured nothing is corrected.
     """
     rows, profiles = residual_um.shape
     steps = max(3, round(ROLL_OFF_REACH_UM / row_pitch_um))
     if profiles < 20 or rows < 2 * steps:
         return None
-    line = edge.reference_row
-    nearest = np.rint(line).astype(np.int64)
+    nearest = np.rint(edge.outermost_row).astype(np.int64)
+    whole = edge.undamaged
+    if np.count_nonzero(whole) < max(20, 0.2 * profiles):
+        return None
     shape = np.zeros(steps + 2)
     for step in range(-1, steps + 1):
         index = nearest - step if edge.side == "last" else nearest + step
-        inside = (index >= 0) & (index < rows)
+        inside = (index >= 0) & (index < rows) & whole
         column = np.flatnonzero(inside)
         values = residual_um[index[inside], column][valid[index[inside], column]]
-        if values.size < profiles * 0.5:
+        if values.size < np.count_nonzero(whole) * 0.5:
             continue
         middle = float(np.median(values))
         u_middle = 1.2533 * robust_sigma(values) * np.sqrt(max(kappa, 1.0) / values.size)
@@ -212,18 +227,42 @@ def _last_row(body: Mask, height: Float32, limit: float) -> Float64:
     return row
 
 
-def _line(row: Float64, profile: Float64, profile_pitch_um: float) -> Float64 | None:
-    """Robust straight line through the undamaged edge points.
+def _point_scatter(row: Float64) -> float:
+    """Scatter of single edge points in rows, from neighbour to neighbour: chips and slopes hardly enter."""
+    return max(robust_sigma(np.diff(row)) / np.sqrt(2.0), 0.3) if np.count_nonzero(np.isfinite(row)) > 2 else 0.3
 
-    Damage only ever takes material away, so the start is a line through the outer part (upper quartile) of each of
-    up to 24 stretches; Tukey's weights then settle it on the points that agree.
+
+def _reference(row: Float64, outline: Float64) -> Float64 | None:
+    """The line the undamaged edge would follow, in rows (edge at the last rows), or None with too few points.
+
+    Its direction is that of the end of the light, which most chips leave alone; its place that of the outermost
+    cluster of sound edge points. A line fitted to the sound points themselves would follow the floor of any chip
+    longer than half of the region.
     """
     good = np.isfinite(row)
-    if np.count_nonzero(good) < max(10, 0.3 * row.size):
+    if np.count_nonzero(good) < max(10, 0.2 * row.size) or np.count_nonzero(np.isfinite(outline)) < 10:
         return None
-    stretches = np.array_split(np.flatnonzero(good), min(24, np.count_nonzero(good) // 4))
+    direction = _fitted(outline, 75.0)
+    distance = row - direction
+    outer = float(np.percentile(distance[good], 95.0))
+    cluster = good & (distance >= outer - 4.0 * _point_scatter(row))
+    if np.count_nonzero(cluster) >= 0.7 * row.size:
+        own = _fitted(np.where(cluster, row, np.nan), 50.0)
+        return own
+    return direction + float(np.median(distance[cluster]))
+
+
+def _fitted(row: Float64, start_percentile: float) -> Float64:
+    """Robust straight line through edge points.
+
+    Damage only ever takes material away, so the start is a line through the given percentile of each of up to 24
+    stretches (Theil-Sen); Tukey's weights then settle it on the points that agree.
+    """
+    profile = np.arange(row.size, dtype=np.float64)
+    good = np.isfinite(row)
+    stretches = np.array_split(np.flatnonzero(good), max(1, min(24, int(np.count_nonzero(good)) // 4)))
     centre = np.array([profile[piece].mean() for piece in stretches])
-    outer = np.array([np.percentile(row[piece], 75.0) for piece in stretches])
+    outer = np.array([np.percentile(row[piece], start_percentile) for piece in stretches])
     if centre.size >= 3:
         slope, intercept, *_ = stats.theilslopes(outer, centre)
     else:

@@ -137,3 +137,64 @@ def range_image(height_um: NDArray[np.floating], pitches_um: tuple[float, float]
         intensity=np.full(height.shape, 120.0, dtype=np.float32),
         width_px=np.full(height.shape, 3.0, dtype=np.float32),
     )
+
+
+@dataclass(frozen=True)
+class Chip:
+    """A notch at the edge: half an ellipsoid along the edge line, ``reach_um`` into the bevel, ``depth_um`` deep."""
+
+    profile_um: float
+    length_um: float
+    reach_um: float
+    depth_um: float
+
+    @property
+    def volume_mm3(self) -> float:
+        return math.pi / 3.0 * (self.length_um / 2.0) * self.reach_um * self.depth_um * 1e-9
+
+    def depth_at(self, from_edge_um: NDArray[np.float64], profile_um: NDArray[np.float64]) -> NDArray[np.float64]:
+        inside = 1.0 - (from_edge_um / self.reach_um) ** 2 - ((profile_um - self.profile_um) / (self.length_um / 2)) ** 2
+        return self.depth_um * np.sqrt(np.clip(inside, 0.0, None))
+
+
+def knife(
+    shape: tuple[int, int] = (1000, 241),
+    pitches_um: tuple[float, float] = (7.15, 8.33),
+    *,
+    chips: tuple[Chip, ...] = (),
+    pits: tuple[Pit, ...] = (),
+    edge_row: float = 930.0,
+    edge_slope_rows: float = 4.0,
+    sigma_um: float = 4.2,
+    missing: float = 0.01,
+    stray: float = 0.02,
+    spikes: float = 0.0,
+    rounding_um: float = 0.0,
+    recession_um: float = 0.0,
+    seed: int = 0,
+    side: str = "last",
+    profiles: tuple[float, ...] = STEPS,
+    sliding: int = 5,
+) -> RangeImage:
+    """A bevel that ends at a sharp edge; beyond it no light but ``stray`` wrong heights. Chips bite into the edge."""
+    plate = surface(
+        shape, pitches_um, pits=pits, sigma_um=sigma_um, seed=seed, profiles=profiles, sliding=sliding
+    )
+    rng = np.random.default_rng(seed + 1)
+    height = plate.height_um.astype(np.float64)
+    row = np.arange(shape[0])[:, None]
+    profile = np.arange(shape[1])[None, :] * pitches_um[1]
+    line = edge_row + edge_slope_rows * np.arange(shape[1])[None, :] / shape[1] - recession_um / pitches_um[0]
+    from_edge = (line - row) * pitches_um[0]
+    for chip in chips:
+        height -= chip.depth_at(np.maximum(from_edge, 0.0), profile)
+    if rounding_um:
+        height -= np.clip(rounding_um - from_edge, 0.0, None) ** 2 / (2.0 * rounding_um)
+    height[rng.random(shape) < missing] = np.nan
+    beyond = from_edge < 0
+    height[beyond & (rng.random(shape) >= stray)] = np.nan
+    wrong = (beyond & np.isfinite(height)) | (rng.random(shape) < spikes)
+    height[wrong & np.isfinite(height)] += rng.uniform(-400, 400, int(np.count_nonzero(wrong & np.isfinite(height))))
+    if side == "first":
+        height = height[::-1]
+    return range_image(np.ascontiguousarray(height), pitches_um)
