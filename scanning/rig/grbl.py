@@ -1,24 +1,24 @@
 """A stage and a laser driven by a GRBL 1.1 controller (also grblHAL), over any port pyserial can open.
 
-Positions are whole motor steps counted by the host. Each move is absolute (G90) with four decimals: in the real firmware
-relative moves drift by one step after 1784 moves of 8.33 um, absolute ones stay exact over 100 mm. The controller's own
-position report has three decimals, coarser than a 0.49 um step, so it serves as a plausibility check only: a stage is
-where it was sent when it reports Idle there within `SANITY_MM`.
+Positions are whole motor steps counted by the host. Each move is absolute (G90) with four decimals: in the real
+firmware relative moves drift by one step after 1784 moves of 8.33 um, absolute ones stay exact over 100 mm. The
+controller's own position report has three decimals, coarser than a 0.49 um step, so it serves as a plausibility check
+only: a stage is where it was sent when it reports Idle there within `SANITY_MM`.
 
-Standstill is learnt from the firmware itself: a dwell of no length (``G4 P0``) sent behind the move is answered when the
-queue is empty, so the exposure starts within a millisecond of it. Polling ``?`` alone costs 6 ms of 115200 baud per step. The
-report that confirms Idle and position is asked for in the same breath and read before the next move, while the
-camera exposes; whenever an answer is missing, the slow way (polling) decides.
+Standstill is learnt from the firmware itself: a dwell of no length (``G4 P0``) sent behind the move is answered when
+the queue is empty, so the exposure starts within a millisecond of it. Polling ``?`` alone costs 6 ms of 115200 baud
+per step. The report that confirms Idle and position is asked for in the same breath and read before the next move,
+while the camera exposes; whenever an answer is missing, the slow way (polling) decides.
 
-The laser hangs on the spindle output. M3 (constant), never M4: in laser mode ($32=1) M4 is dark at standstill, and a scan
-exposes at standstill. With $32=1 an M3 given while the modal motion is G0 stays dark as well, so the laser is switched
-on in one line with ``G1`` and no move ever uses G0; with $32=0 the same line means the same. A feed hold darkens
-an M3 laser only when $32=1; therefore nothing here relies on a hold to make light go out: emergency stop is hold
-followed at once by a reset, which switches the output off in the firmware's interrupt.
+The laser hangs on the spindle output. M3 (constant), never M4: in laser mode ($32=1) M4 is dark at standstill, and a
+scan exposes at standstill. With $32=1 an M3 given while the modal motion is G0 stays dark as well, so the laser is
+switched on in one line with ``G1`` and no move ever uses G0; with $32=0 the same line means the same. A feed hold
+darkens an M3 laser only when $32=1; therefore nothing here relies on a hold to make light go out: emergency stop is
+hold followed at once by a reset, which switches the output off in the firmware's interrupt.
 
-If this process dies the controller must darken the laser by itself; GRBL alone does not notice. The rig leads the serial
-adapter's DTR (dropped by the kernel with the process) through the laser's enable: see `simulated/controller.py`.
-"""
+If this process dies the controller must darken the laser by itself; GRBL alone does not notice. The rig leads the
+serial adapter's DTR (dropped by the kernel with the process) through the laser's enable: see
+`simulated/controller.py`."""
 
 from __future__ import annotations
 
@@ -110,23 +110,34 @@ class GrblStage:
         self.link.close()
 
     def home(self) -> None:
-        """Find the zero. With a home switch this moves; without one see ``zero="here"``."""
+        """Find the zero, from whatever state the controller is in (alarm, hold, emergency stop included).
+
+        With a home switch this moves. Without one see ``zero="here"``; while that zero is still known, this goes to it.
+        """
+        if self._zero == "here":
+            self._go_to_given_zero()
+            return
         self._forget()
-        if self._zero == "homing":
-            if self.controller_settings.get(22, 0.0) == 0:
-                raise StageFault(
-                    f"The controller on {self.link.port} has homing switched off ($22=0); set $22=1 if the stage has a "
-                    "home switch, or set the rig's zero to 'here'."
-                )
-            self.link.command("$H", timeout_s=self._homing_timeout_s(), repeatable=False)
+        # Clears holds and jogs, and wakes a controller that is deaf after a limit alarm.
+        self.link.reset()
+        if self.controller_settings.get(22, 0.0) == 0:
+            raise StageFault(
+                f"The controller on {self.link.port} has homing switched off ($22=0); set $22=1 if the stage has a "
+                "home switch, or set the rig's zero to 'here'."
+            )
+        self.link.command("$H", timeout_s=self._homing_timeout_s(), repeatable=False)
+        self._set_zero()
+
+    def _go_to_given_zero(self) -> None:
+        if self._count is not None:
+            self.move_to(0)
         elif self._zero_given:
             raise StageFault(
                 "The stage has no home switch and its controller was reset, so its zero is lost; "
                 "put the carriage at its zero and open the rig again."
             )
-        elif self.link.status().state == "Alarm":
-            self.link.command("$X")
-        self._set_zero()
+        else:
+            self.set_zero_here()
 
     def move_to(self, steps: int) -> None:
         """Move to ``steps`` from zero and return at standstill. Refuses positions outside the travel before moving."""
@@ -142,8 +153,8 @@ class GrblStage:
         self.confirm()
         self._count = None  # until it is proven to be there again
         machine_mm = self._zero_machine_mm + self._direction * target_mm
-        feed = "" if self._feed_sent else f" F{self._feed_mm_min:.3f}"
-        lines = [f"G1 X{self._direction * target_mm:.4f}{feed}", "G4 P0"]
+        feed = "" if self._feed_sent else f"F{self._feed_mm_min:.3f}"
+        lines = [f"G1X{self._direction * target_mm:.4f}{feed}", "G4P0"]  # no spaces: 87 us a byte
         distance_mm = abs(steps - here) * self.step_um / 1000
         expected_s = _travel_time_s(distance_mm, self._feed_mm_min / 60, self.controller_settings[120])
         for attempt in range(1, ATTEMPTS + 1):
@@ -156,8 +167,8 @@ class GrblStage:
                 break
             if last:
                 raise StageFault(
-                    f"The stage on {self.link.port} did not go to {target_mm:.3f} mm in {ATTEMPTS} attempts because lines "
-                    "were lost on the way; check cable and shielding, then home the stage."
+                    f"The stage on {self.link.port} did not go to {target_mm:.3f} mm in {ATTEMPTS} attempts because "
+                    "lines were lost on the way; check cable and shielding, then home the stage."
                 )
         self._feed_sent = True
         self._count = steps
@@ -168,19 +179,20 @@ class GrblStage:
         if expected is None:
             return
         status = self.link.asked_status()
-        if status is None or status.state != "Idle" or not self._is_at(status, expected):
-            if not self._reached(expected, 0.0):
-                self._count = None
-                where = self.link.status().machine_mm
-                raise StageFault(
-                    f"The stage stands at {where} mm instead of {expected:.3f} mm (machine position); "
-                    "check the serial line and the mechanics, then home the stage."
-                )
+        if status is not None and status.state == "Idle" and self._is_at(status, expected):
+            return
+        if not self._reached(expected, 0.0):
+            self._count = None
+            where = self.link.status().machine_mm
+            raise StageFault(
+                f"The stage stands at {where} mm instead of {expected:.3f} mm (machine position); "
+                "check the serial line and the mechanics, then home the stage."
+            )
 
     @property
     def position_steps(self) -> int:
         if self._count is None:
-            raise StageFault("The stage does not know where it is; home it first.")
+            raise StageFault(self.link.halted or "The stage does not know where it is; home it first.")
         return self._count
 
     def park(self) -> None:
@@ -202,7 +214,7 @@ class GrblStage:
         return self._count is not None
 
     def set_zero_here(self) -> None:
-        """Take the place where the carriage stands as zero (stages without a home switch, after a person put it there)."""
+        """Take the place where the carriage stands as zero, after a person put it there (no home switch)."""
         if self.link.status().state == "Alarm":
             self.link.command("$X")
         self._set_zero()
@@ -290,8 +302,8 @@ class GrblStage:
         off = max(abs(found[100] * self.step_um / 1000 - 1) - 0.0005 / found[100], 0.0) * travel_steps
         if off > MAX_STEP_ERROR:
             raise StageFault(
-                f"The controller on {port} is set to {found[100]:g} steps per mm ($100) but a step of {self.step_um:g} um "
-                f"needs {1000 / self.step_um:.4f}; correct $100 or the rig's step length."
+                f"The controller on {port} is set to {found[100]:g} steps per mm ($100) but a step of "
+                f"{self.step_um:g} um needs {1000 / self.step_um:.4f}; correct $100 or the rig's step length."
             )
 
     def _homing_timeout_s(self) -> float:
@@ -364,7 +376,7 @@ class GrblLaser:
         if not link.is_open:
             return  # `close` has reset the controller already
         try:
-            state = link.status().state
+            state = link.status(attempts=1).state
             if state in ("Idle", "Run", "Check"):
                 # M5 waits for the move under way; a step takes milliseconds, a long move is cut short by the reset.
                 link.command("M5", timeout_s=1.0, repeatable=False)

@@ -2,8 +2,8 @@
 
 GRBL has no checksums and no addresses; the only defence is bookkeeping. This file owns it: every line is answered
 before the receive buffer of the controller could overflow (character counting), a greeting in mid-conversation is a
-reset, an ALARM may come at any time, bytes that make no sense are counted. Without it a dropped ``ok`` would hang a scan
-for ever and a controller that restarted by itself would be believed to stand where it does not.
+reset, an ALARM may come at any time, bytes that make no sense are counted. Without it a dropped ``ok`` would hang a
+scan for ever and a controller that restarted by itself would be believed to stand where it does not.
 
 Every wait ends: by an answer, or by a `StageFault` within the time the caller gave.
 """
@@ -17,7 +17,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 
 import serial
@@ -86,6 +86,11 @@ class GrblLink:
     def is_open(self) -> bool:
         return self._serial is not None
 
+    @property
+    def halted(self) -> str | None:
+        """Why nothing may be done until the next `reset`, or None."""
+        return self._halted
+
     def open(self) -> None:
         """Open the port for us alone, reset the controller and wait until it is ready to talk."""
         try:
@@ -106,10 +111,8 @@ class GrblLink:
         """Let go of the port. Never raises."""
         port, self._serial = self._serial, None
         if port is not None:
-            try:
+            with suppress(Exception):  # a cable that is gone cannot be closed, and that is fine
                 port.close()
-            except Exception:  # noqa: BLE001 - a cable that is gone cannot be closed, and that is fine
-                pass
 
     def _find_controller(self) -> None:
         """A board may reset when the port opens, or not; may greet, or not. All of these end in a known state."""
@@ -154,7 +157,9 @@ class GrblLink:
         greeted = self._await_greeting(GREETING_S)
         self.drain()
         if not greeted and not self._answers_status():
-            raise StageFault(f"The stage controller on {self.port} did not come back after a reset; switch it off and on.")
+            raise StageFault(
+                f"The stage controller on {self.port} did not come back after a reset; switch it off and on."
+            )
 
     def drain(self) -> None:
         """Read away what is still under way, until the line is quiet."""
@@ -271,11 +276,11 @@ class GrblLink:
                 raise _Refused(waiting[0], int(number) if number.isdigit() else 0)
             said.append(text)
 
-    def status(self, *, timeout_s: float = 1.0) -> Status:
+    def status(self, *, timeout_s: float = 1.0, attempts: int = ATTEMPTS) -> Status:
         """Ask ``?`` and return the report. Asks again when noise ate the question or the answer."""
         self._settle()
         self._unsettled = True
-        for attempt in range(ATTEMPTS):
+        for attempt in range(attempts):
             if attempt:
                 self._count(retries=1)
             self.realtime(b"?")
@@ -315,7 +320,10 @@ class GrblLink:
     # ---- hearing ------------------------------------------------------------------------------------------------
 
     def _next(self, deadline: float) -> str | None:
-        """The next meaningful line: ok, error:n, <status>, [info], $n=v. None at the deadline. Raises on alarm, reset."""
+        """The next meaningful line (ok, error:n, <status>, [info], $n=v), or None at the deadline.
+
+        Raises `StageFault` for an alarm or a reset, whenever they come.
+        """
         while (line := self._read_line(deadline)) is not None:
             if line == "ok" or re.fullmatch(r"error:\d+", line):
                 return line
@@ -328,10 +336,10 @@ class GrblLink:
                     "check its supply and cable, then home the stage."
                 )
             if line.startswith("<"):
-                if _STATUS.fullmatch(line):
+                if self._parse_status(line) is not None:
                     return line
                 self._count(bad_lines=1)
-            elif line.startswith("[") and line.endswith("]") or line.startswith(("$", ">")):
+            elif (line.startswith("[") and line.endswith("]")) or line.startswith(("$", ">")):
                 return line
             else:
                 self._count(bad_lines=1)
@@ -381,7 +389,6 @@ class GrblLink:
             work = float(fields["WPos"].split(",")[0]) if "WPos" in fields else None
             free = int(fields["Bf"].split(",")[0]) if "Bf" in fields else None
         except ValueError:
-            self._count(bad_lines=1)
             return None
         if machine is None and work is not None and self._wco_mm is not None:
             machine = work + self._wco_mm
@@ -415,7 +422,7 @@ class GrblLink:
 
     @contextmanager
     def _trouble(self, doing: str) -> Iterator[None]:
-        """pyserial reports a pulled cable in many ways (its own error, OSError, termios.error, TypeError after close)."""
+        """A pulled cable comes out of pyserial in many ways: its own error, OSError, termios.error, TypeError."""
         try:
             yield
         except StageFault:

@@ -121,7 +121,11 @@ def open_rig(config: Config) -> Iterator[Rig]:
         yield rig
     finally:
         # `close` of the stage also resets the controller, which darkens the laser even if `off` failed.
-        for what, do in (("laser off", rig.laser.off), ("stage close", rig.stage.close), ("camera close", rig.camera.close)):
+        for what, do in (
+            ("laser off", rig.laser.off),
+            ("stage close", rig.stage.close),
+            ("camera close", rig.camera.close),
+        ):
             try:
                 do()
             except Exception:  # each must be tried; the fault that brought us here is the one to show

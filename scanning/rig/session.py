@@ -1,12 +1,12 @@
 """One scan on one rig: home, light, step, expose, hand on; and whatever happens, dark and parked at the end.
 
-The loop is limited by the hardware. The stage moves on as soon as the shutter has closed on a step's last exposure; read-out
-and everything that is done with frames (storing, measuring) happens meanwhile, the latter in a second thread behind a short
-queue. When that thread falls behind the loop waits and says how long; when it fails the scan ends with its error.
+The loop is limited by the hardware. The stage moves on as soon as the shutter has closed on a step's last exposure;
+read-out and everything that is done with frames (storing, measuring) happens meanwhile, the latter in a second thread
+behind a short queue. When that thread falls behind the loop waits and says how long; when it fails the scan ends with
+its error.
 
-Safety is this file's other half: there is one `finally` in `acquire`; it switches the laser off and parks the stage, each is
-attempted even when the other failed, and nothing that is raised inside can pass it by.
-"""
+Safety is this file's other half: there is one `finally` in `acquire`; it switches the laser off and parks the stage,
+each is attempted even when the other failed, and nothing that is raised inside can pass it by."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ QUEUED_STEPS = 4
 PAUSE_LOOK_S = 0.25
 #: Every scan position is approached from this far below, so that the play of the screw lies always on the same side.
 APPROACH_UM = 100.0
-#: Steps of a scan that may be taken again after a bad frame, as a share of all steps (at least one). Beyond it the camera
-#: or its network is faulty and a person should look.
+#: Steps of a scan that may be taken again after a bad frame, as a share of all steps (at least one). Beyond it the
+#: camera or its network is faulty and a person should look.
 RETAKE_SHARE = 0.01
 
 
@@ -61,10 +61,9 @@ class Control(Protocol):
 class ScanPlan:
     """What to scan. ``steps`` stage positions, ``motor_steps`` motor steps apart (17 x 0.49 um = 8.33 um).
 
-    ``exposures_us`` ascends; a logarithmic camera has exactly one, 0. ``first_step`` > 0 continues a scan whose earlier
-    steps exist already. ``settle_s`` is waited at standstill before the first exposure of a step. ``frame_timeout_s`` is
-    how long a frame may take beyond its exposure.
-    """
+    ``exposures_us`` ascends; a logarithmic camera has exactly one, 0. ``first_step`` > 0 continues a scan whose
+    earlier steps exist already. ``settle_s`` is waited at standstill before the first exposure of a step.
+    ``frame_timeout_s`` is how long a frame may take beyond its exposure."""
 
     start_mm: float
     steps: int
@@ -79,8 +78,8 @@ class ScanPlan:
         """Raise `BadInput` with one sentence when this plan cannot be carried out on ``rig``."""
         if not (self.steps >= 1 and self.motor_steps >= 1 and 0 <= self.first_step < self.steps):
             raise BadInput(
-                f"A scan needs at least one step and one motor step per step and must begin inside itself; this one has "
-                f"{self.steps} steps of {self.motor_steps} motor steps and begins at step {self.first_step}."
+                f"A scan needs at least one step and one motor step per step and must begin inside itself; this one "
+                f"has {self.steps} steps of {self.motor_steps} motor steps and begins at step {self.first_step}."
             )
         if not self.exposures_us or not all(math.isfinite(e) and e >= 0 for e in self.exposures_us):
             raise BadInput("A scan needs at least one exposure time, in microseconds, none of them negative.")
@@ -105,9 +104,14 @@ class ScanPlan:
 
 @dataclass
 class TimeBudget:
-    """Where the time of a scan went, in seconds of wall clock; ``software_s`` is what is left of ``wall_s``."""
+    """Where the time of a scan went, in seconds of wall clock; ``software_s`` is what is left of ``wall_s``.
+
+    ``exposure_s`` holds what the sensor makes exposures wait for each other; ``setup_s`` is the configuration of the
+    camera and the dark frame, ``parking_s`` everything after the last frame.
+    """
 
     wall_s: float = 0.0
+    setup_s: float = 0.0
     homing_s: float = 0.0
     motion_s: float = 0.0
     settle_s: float = 0.0
@@ -115,11 +119,12 @@ class TimeBudget:
     readout_s: float = 0.0
     sink_wait_s: float = 0.0
     paused_s: float = 0.0
+    parking_s: float = 0.0
 
     @property
     def software_s(self) -> float:
-        known = self.homing_s + self.motion_s + self.settle_s + self.exposure_s + self.readout_s
-        return max(self.wall_s - known - self.sink_wait_s - self.paused_s, 0.0)
+        known: float = sum(value for name, value in vars(self).items() if name != "wall_s")
+        return max(self.wall_s - known, 0.0)
 
     @property
     def software_share(self) -> float:
@@ -153,8 +158,8 @@ def acquire(
     """Scan and return when the rig is dark and parked.
 
     ``on_frames(step, frames)`` gets the frames of each step, shortest exposure first, in order of steps, in one other
-    thread (open and close thread-bound things such as database connections there, or do not use them). Its exception ends
-    the scan and comes out of here. ``control`` is read in the calling thread.
+    thread (open and close thread-bound things such as database connections there, or do not use them). Its exception
+    ends the scan and comes out of here. ``control`` is read in the calling thread.
 
     Raises `BadInput` for a plan that cannot be carried out, before anything moves; `RigFault` when hardware fails;
     `Stopped` when cancelled. A scan that is finished early returns normally.
@@ -165,15 +170,18 @@ def acquire(
     began = clock.monotonic()
     sink = _Sink(on_frames)
     failure: BaseException | None = None
+    ended = began
     try:
         scan.run(sink)
-    except BaseException as fault:  # noqa: BLE001 - raised again below, when the rig is safe
+    except BaseException as fault:  # raised again below, when the rig is safe
         failure = fault
     finally:
+        ended = clock.monotonic()
         # The light goes out before anything is waited for.
         failure = _attempt(failure, lambda: _darken(rig), "switch the laser off")
         failure = _attempt(failure, lambda: _park(rig), "park the stage")
         failure = _attempt(failure, sink.finish, "hand on the last frames")
+        scan.summary.time.parking_s = clock.monotonic() - ended
         scan.summary.time.wall_s = clock.monotonic() - began
         scan.summary.link = rig.stage.link_quality()
     if failure is not None:
@@ -237,10 +245,11 @@ class _Scan:
 
     def run(self, sink: _Sink) -> None:
         plan, spent = self.plan, self.summary.time
-        self.rig.camera.configure(plan.mode)
-        self.rig.laser.off()
-        # Before anything moves: a camera that sends nothing, or a room too bright, is found out here.
-        dark = self._checked(self._grab(plan.exposures_us[0]), plan.exposures_us[0])
+        with _Stopwatch(self.clock, spent, "setup_s"):
+            self.rig.camera.configure(plan.mode)
+            self.rig.laser.off()
+            # Before anything moves: a camera that sends nothing is found out here.
+            dark = self._checked(self._grab(plan.exposures_us[0]), plan.exposures_us[0])
         self.summary.dark_level = float(np.median(dark.image))
         step = plan.first_step
         self._take_place(step)
@@ -354,11 +363,13 @@ class _Scan:
             )
         if frame.image.dtype != (np.uint8 if mode.bits <= 8 else np.uint16):
             raise CameraFault(
-                f"The camera sent pixels of type {frame.image.dtype} instead of {mode.bits} bits; check its pixel format."
+                f"The camera sent pixels of type {frame.image.dtype} instead of {mode.bits} bits; "
+                "check its pixel format."
             )
         if frame.exposure_us != exposure_us:
             raise CameraFault(
-                f"The camera exposed for {frame.exposure_us:g} us instead of {exposure_us:g} us; check its exposure range."
+                f"The camera exposed for {frame.exposure_us:g} us instead of {exposure_us:g} us; "
+                "check its exposure range."
             )
         if self._last_id is not None and frame.frame_id <= self._last_id:
             raise CameraFault(
@@ -423,5 +434,5 @@ class _Sink:
             if self._failed is None:
                 try:
                     self._on_frames(*item)
-                except BaseException as fault:  # noqa: BLE001 - carried over to the scan's thread, which raises it
+                except BaseException as fault:  # carried over to the scan's thread, which raises it
                     self._failed = fault

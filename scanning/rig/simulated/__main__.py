@@ -1,8 +1,7 @@
 """Run a simulated rig: ``python -m scanning.rig.simulated --dir DIR [--speed-up X] [--scene R2 ...]``.
 
-Makes DIR/stage.tty and DIR/camera.sock, says so in one line, and runs until it is terminated or, with ``--with-parent``,
-until the process that started it is gone.
-"""
+Makes DIR/stage.tty and DIR/camera.sock, says so in one line, and runs until it is terminated or, with
+``--with-parent``, until the process that started it is gone. """
 
 from __future__ import annotations
 
@@ -18,7 +17,9 @@ from scanning.rig.simulated.bench import Bench, Part
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m scanning.rig.simulated", description="Run a simulated scanning rig.")
+    parser = argparse.ArgumentParser(
+        prog="python -m scanning.rig.simulated", description="Run a simulated scanning rig."
+    )
     parser.add_argument("--dir", type=Path, required=True, help="where stage.tty and camera.sock are made")
     parser.add_argument("--speed-up", type=float, default=1.0, help="how much faster than real time the rig moves")
     parser.add_argument("--scene", default="R1", help="what lies on the rig: R1, R2, R3, gauge, flat")

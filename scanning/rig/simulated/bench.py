@@ -201,10 +201,9 @@ class Bench:
     def provoke(self, part: str, fault: str, **options: Any) -> None:
         """Let something fail.
 
-        ``camera``: silent, incomplete, wrong_size, stuck, hang_up (``count`` frames). ``stage``: unplug, replug, reset,
-        alarm (``code``), garbage (``text``), drop_to_host, drop_to_controller (``count`` bytes), mute, unmute, dead_switch;
-        unplug, reset and alarm also with ``in_move=True``: in the middle of the next move.
-        """
+        ``camera``: silent, incomplete, wrong_size, stuck, hang_up (``count`` frames). ``stage``: unplug, replug,
+        reset, alarm (``code``), garbage (``text``), drop_to_host, drop_to_controller (``count`` bytes), mute, unmute,
+        dead_switch; unplug, reset and alarm also with ``in_move=True``: in the middle of the next move. """
         if part == "camera":
             if not hasattr(self.camera_faults, fault):
                 raise BadInput(f"The camera has no fault '{fault}'.")
@@ -259,6 +258,8 @@ class Bench:
                     self._answer(guest, exposure, request)
                 except Fault as fault:
                     send_message(guest, {"fault": str(fault)})
+                except (KeyError, TypeError, ValueError) as fault:
+                    send_message(guest, {"fault": f"The simulated rig cannot do {request.get('do')!r}: {fault}."})
         except (WireClosed, OSError):
             pass
         finally:
@@ -280,7 +281,9 @@ class Bench:
             options = dict(request.get("options") or {})
             start_mm = float(options.pop("start_mm", self._part.start_mm))
             part = Part(str(request["scene"]), int(request["seed"]), float(request["wear_um"]), start_mm, options)
-            self._darkroom.submit(self.optics, part, SensorMode(rows=16, columns=64)).result()  # refuse now, not in the scan
+            # Build it now, in the region of interest used last: a part that cannot be is refused here, not in the scan.
+            mode = self._optics[1] if self._optics else SensorMode(rows=16, columns=64)
+            self._darkroom.submit(self.optics, part, mode).result()
             self.load(part)
             send_message(guest, {})
         elif do == "state":
@@ -350,7 +353,9 @@ class _Exposures:
         _, at_end, power_at_end = self._look()
         moved = abs(at_end - at_begin) > SMEAR_UM
         positions = (at_begin, (at_begin + at_end) / 2, at_end) if moved else (at_begin,)
-        readout_us = READOUT_OVERHEAD_US + mode.rows * mode.columns * (1 if mode.bits <= 8 else 2) / READOUT_BYTES_PER_US
+        readout_us = (
+            READOUT_OVERHEAD_US + mode.rows * mode.columns * (1 if mode.bits <= 8 else 2) / READOUT_BYTES_PER_US
+        )
         self._sensor_free_s = end_s + readout_us * 1e-6
         bench.frames += 1
         shot = (exposure_us, positions, min(power, power_at_end), bench.frames)

@@ -2,18 +2,18 @@
 
 The driver is written against the real firmware; this stands in for it wherever a board is not at hand: same answers,
 same buffer of 128 bytes, same 15 planner blocks, same float32 arithmetic (which drifts in G91), same alarms. It also
-does what the firmware repository cannot: it has limit switches, a laser, faults on demand, and time that can run faster.
+does what the firmware repository cannot: it has limit switches, a laser, faults on demand, and time that can run
+faster.
 
 No clock, no thread, no file lives here. Whoever owns the wire (`wire.py`) says what time it is, hands over bytes and
 asks for bytes; so every test can be exact.
 
-The laser's dead-man. GRBL switches its spindle output off on reset and on any alarm, but it does not notice a host that
-died. Rigs therefore lead the serial adapter's DTR line, which the host's kernel drops when the process holding the port
-ends in whatever way, through the laser's enable input and the controller's feed-hold pin (GRBL A1). That is what
-`link_lost` models: light out at once, feed hold, and a full reset when a host opens the port again, because the
-rising DTR pulses the reset pin of Arduino boards. On a board without that wire a killed host leaves the laser on until the port
-is opened again: fit the wire.
-"""
+The laser's dead-man. GRBL switches its spindle output off on reset and on any alarm, but it does not notice a host
+that died. Rigs therefore lead the serial adapter's DTR line, which the host's kernel drops when the process holding
+the port ends in whatever way, through the laser's enable input and the controller's feed-hold pin (GRBL A1). That is
+what `link_lost` models: light out at once, feed hold, and a full reset when a host opens the port again, because the
+rising DTR pulses the reset pin of Arduino boards. On a board without that wire a killed host leaves the laser on until
+the port is opened again: fit the wire. """
 
 from __future__ import annotations
 
@@ -90,7 +90,9 @@ class Controller:
     leaves the carriage) and ``laser_power`` (0..1); what the controller believes is its own affair.
     """
 
-    def __init__(self, *, settings: dict[int, float] | None = None, baud: int = 115200, start_um: float = 7000.0) -> None:
+    def __init__(
+        self, *, settings: dict[int, float] | None = None, baud: int = 115200, start_um: float = 7000.0
+    ) -> None:
         self.settings = DEFAULT_SETTINGS | (settings or {})
         self.faults = Faults()
         self.now = 0.0
@@ -569,10 +571,9 @@ class Controller:
             raise _GcodeError(3)
 
     def _store(self, number: int, text: str) -> None:
-        try:
-            value = float(text)
-        except ValueError:
-            raise _GcodeError(2) from None
+        if not any(c.isdigit() for c in text):
+            raise _GcodeError(2)
+        value = _read_float(text)
         if number not in self.settings:
             raise _GcodeError(3)
         if value < 0:
@@ -864,6 +865,22 @@ def _words(line: str) -> list[tuple[str, float]]:
         match = re.match(r"[-+]?(\d+\.?\d*|\.\d+)", line[at + 1 :])
         if match is None:
             raise _GcodeError(2)
-        words.append((line[at], float(match[0])))
+        words.append((line[at], _read_float(match[0])))
         at += 1 + match.end()
     return words
+
+
+def _read_float(text: str) -> float:
+    """GRBL's own number reader (nuts_bolts.c): eight digits, scaled in float32; its last bit decides about drift."""
+    sign, digits = (-1.0, text[1:]) if text[0] == "-" else (1.0, text.lstrip("+"))
+    whole, _, part = digits.partition(".")
+    used = (whole + part)[:8]
+    exponent = len(whole) - len(used) if len(whole) > len(used) else -(len(used) - len(whole))
+    value = np.float32(int(used or "0"))
+    while exponent <= -2:
+        value, exponent = np.float32(float(value) * 0.01), exponent + 2
+    if exponent == -1:
+        value = np.float32(float(value) * 0.1)
+    elif exponent > 0:
+        value = np.float32(float(value) * 10.0**exponent)
+    return sign * float(value)

@@ -1,0 +1,109 @@
+"""Opening a stage that is not there, not ours, not GRBL or not set up: one sentence each, with what to do."""
+
+from __future__ import annotations
+
+import os
+import pty
+import tty
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from scanning.errors import BadInput, StageFault
+from scanning.rig.grbl import GrblLaser, GrblStage
+from scanning.rig.grbl_messages import ALARMS, ERRORS, alarm_sentence, error_sentence
+from scanning.rig.simulated.bench import Bench
+
+
+def test_a_port_that_is_not_there() -> None:
+    with pytest.raises(StageFault, match="no serial port /dev/no-such-stage; check that the stage is plugged in"):
+        GrblStage("/dev/no-such-stage").open()
+
+
+def test_a_port_that_is_no_serial_port(tmp_path: Path) -> None:
+    (tmp_path / "stage").write_text("not a port")
+    with pytest.raises(StageFault, match="check"):
+        GrblStage(str(tmp_path / "stage")).open()
+
+
+def test_a_port_that_another_program_has(make_bench: Callable[..., Bench]) -> None:
+    bench = make_bench()
+    first = GrblStage(bench.port)
+    first.open()
+    with pytest.raises(StageFault, match="in use by another program"):
+        GrblStage(bench.port).open()
+    first.home()  # and the one who has it is not disturbed
+    first.close()
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may open everything")
+def test_a_port_without_permission(tmp_path: Path) -> None:
+    port = tmp_path / "stage"
+    port.touch(mode=0o000)
+    with pytest.raises(StageFault, match="dialout"):
+        GrblStage(str(port)).open()
+
+
+def test_a_serial_server_that_is_not_there() -> None:
+    with pytest.raises(StageFault, match=r"socket://127.0.0.1:9"):
+        GrblStage("socket://127.0.0.1:9").open()
+
+
+def test_a_port_on_which_nobody_answers() -> None:
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    ticks = iter(range(10_000))
+    stage = GrblStage(os.ttyname(slave), clock=lambda: next(ticks) * 0.2)
+    with pytest.raises(StageFault, match="no GRBL controller answers; check that it is the stage's port"):
+        stage.open()
+    assert not stage.link.is_open
+    os.close(master)
+    os.close(slave)
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({110: 1000.0}, r"34014 steps a second .* lower \$110 to 882 mm/min"),
+        ({100: 250.0}, r"set to 250 steps per mm .* needs 2040.8163"),
+        ({130: 60.0}, r"travel is 100 mm but the controller .* allows 59 mm"),
+    ],
+)
+def test_a_controller_that_is_set_up_wrongly(
+    make_bench: Callable[..., Bench], settings: dict[int, float], sentence: str
+) -> None:
+    bench = make_bench(settings=settings)
+    stage = GrblStage(bench.port, travel_mm=100.0)
+    with pytest.raises(StageFault, match=sentence):
+        stage.open()
+    assert not stage.link.is_open
+
+
+def test_moving_before_homing(make_bench: Callable[..., Bench]) -> None:
+    bench = make_bench()
+    stage = GrblStage(bench.port)
+    stage.open()
+    with pytest.raises(StageFault, match="home it first"):
+        stage.move_to(17)
+    stage.close()
+
+
+def test_settings_that_mean_nothing() -> None:
+    with pytest.raises(BadInput, match="'homing' or 'here'"):
+        GrblStage("x", zero="somewhere")
+    with pytest.raises(BadInput, match="positive length"):
+        GrblStage("x", step_um=0.0)
+    with pytest.raises(BadInput, match="share above 0"):
+        GrblLaser(GrblStage("x"), power=0.0)
+
+
+def test_every_grbl_number_has_a_sentence() -> None:
+    """GRBL 1.1 knows errors 1-38 (19 is not used) and alarms 1-9 (doc/csv of the firmware)."""
+    assert set(ERRORS) >= set(range(1, 39)) - {19}
+    assert set(ALARMS) >= set(range(1, 10))
+    assert error_sentence(9) == (
+        "the controller is locked after an alarm (error:9); find the cause, then home the stage"
+    )
+    assert "ALARM:77" in alarm_sentence(77)
+    assert "error:77" in error_sentence(77)
