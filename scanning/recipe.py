@@ -94,13 +94,14 @@ class Line:
     0.1, after GLT what 0.05 of the light became (0.59 at p = 0.5), 0.6 from a logarithmic camera.
     The share counts from the row's mean (``floor_from`` "row_mean") or from "zero".
     ``ceiling``: the image mean asks for no more than this share of the mean row maximum (0: no ceiling).
-    ``grain_px``: peaks this many pixels or less apart are grains of one line (0: never), as long as together they are
-    no wider than ``grain_span`` x the line's width. ``width_px``: line width in px, None takes the header's, or
-    estimates it. ``width_factor``: a peak passes the width check between width/factor and width*factor. ``gate_px``,
-    ``gate_max_px``: how far the line may move from row to row: gate_px (1 + rows missed), at most gate_max_px.
-    ``seed``: ``first`` follows the line from the first good row from the bottom; ``longest`` tries the others too when
-    that line turns out short. The paper to the letter is floor 0.1, floor_from
-    zero, ceiling 0, grain_px 0, seed first.
+    ``snr``: a peak must be higher than this many standard deviations of a pixel's noise; None means 4, or 3 on
+    compressed grey, whose noise is lifted. ``grain_px``: peaks this many pixels or less apart are grains of one line
+    (0: never; None: 3 px, or a quarter of the line's width where that is more).
+    ``width_px``: line width in px, None takes the header's, or estimates it. ``width_factor``: a peak passes the width
+    check between width/factor and width*factor. ``gate_px``, ``gate_max_px``: how far the line may move from row to
+    row: gate_px (1 + rows missed), at most gate_max_px. ``seed``: ``first`` follows the line from the first good row
+    from the bottom; ``best`` also tries others and takes the line most like the line.
+    The paper to the letter is floor 0.1, floor_from zero, ceiling 0, snr 0, grain_px 0, seed first.
     """
 
     key: ClassVar[str] = "msnn"
@@ -108,13 +109,13 @@ class Line:
     floor: float | None = None
     floor_from: str = "row_mean"
     ceiling: float = 0.5
-    grain_px: float = 3.0
-    grain_span: float = 3.0
+    snr: float | None = None
+    grain_px: float | None = None
     width_px: float | None = None
     width_factor: float = 2.0
     gate_px: float = 12.0
     gate_max_px: float = 64.0
-    seed: str = "longest"
+    seed: str = "best"
 
     def __post_init__(self) -> None:
         if self.k is not None:
@@ -123,14 +124,16 @@ class Line:
             _number("msnn.floor", self.floor, 0.0, 0.99)
         _choice("msnn.floor_from", self.floor_from, ("row_mean", "zero"))
         _number("msnn.ceiling", self.ceiling, 0.0, 1.0)
-        _number("msnn.grain_px", self.grain_px, 0.0, 1e5)
-        _number("msnn.grain_span", self.grain_span, 0.0, 1e5)
+        if self.snr is not None:
+            _number("msnn.snr", self.snr, 0.0, 1000.0)
+        if self.grain_px is not None:
+            _number("msnn.grain_px", self.grain_px, 0.0, 1e5)
         if self.width_px is not None:
             _number("msnn.width_px", self.width_px, 0.0, 1e5, above=True)
         _number("msnn.width_factor", self.width_factor, 1.0, 1e6)
         _number("msnn.gate_px", self.gate_px, 0.0, 1e6)
         _number("msnn.gate_max_px", self.gate_max_px, self.gate_px, 1e6)
-        _choice("msnn.seed", self.seed, ("first", "longest"))
+        _choice("msnn.seed", self.seed, ("first", "best"))
 
 
 @dataclass(frozen=True)
@@ -378,10 +381,10 @@ def _read_text(_name: str, text: str) -> str:
 
 _READERS: dict[str, Callable[[str, str], Any]] = {
     "mode": _read_text, "window": _read_int, "saturated": _read_text, "p": _read_float,
-    "k": _read_float_or_default, "floor": _read_float_or_default, "ceiling": _read_float, "grain_px": _read_float,
-    "grain_span": _read_float,
+    "k": _read_float_or_default, "floor": _read_float_or_default, "floor_from": _read_text, "ceiling": _read_float,
+    "snr": _read_float_or_default, "grain_px": _read_float_or_default,
     "width_px": _read_float_or_default, "width_factor": _read_float, "gate_px": _read_float,
-    "gate_max_px": _read_float, "seed": _read_text, "floor_from": _read_text,
+    "gate_max_px": _read_float, "seed": _read_text,
 }  # fmt: skip
 
 

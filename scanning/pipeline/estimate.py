@@ -11,12 +11,14 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from scanning.pipeline.centroid import centre_of_gravity
 from scanning.pipeline.grey import DARK_UNIT
-from scanning.pipeline.line import lowest_code_above, row_light, row_maxima, row_peaks
+from scanning.pipeline.line import half_width, lowest_code_above, row_light, row_maxima, row_peaks
 
 PIXELS_LOOKED_AT = 1 << 16
 FEWEST_ROWS = 8
 GRAIN_PX = 3.0
+INT64_TOP = (1 << 62) - 1
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 
@@ -52,12 +54,14 @@ def dark_level(images: Sequence[Image], saturation: int) -> float:
 def line_width_px(
     images: Sequence[Image], saturation: int, dark: float, k: float, floor: float, ceiling: float
 ) -> float | None:
-    """Median full width at half maximum of the highest peaks, px; None when too few rows show one.
+    """Full width at half maximum of the mean line, px; None when too few rows show one.
 
-    Only rows whose peak reaches a quarter of the bright ones count, so that noise in dark rows has no say.
+    The highest peaks of all rows are laid on each other by their centres and averaged: the width of a single row is
+    that of its brightest speckle grain. Only rows whose peak reaches a quarter of the bright ones count, so that noise
+    in dark rows has no say.
     """
     heights: list[float] = []
-    widths: list[float] = []
+    seen: list[tuple[NDArray[np.float64], float, int]] = []
     level = round(dark * DARK_UNIT)
     for image in images:
         rows, columns = image.shape
@@ -77,14 +81,25 @@ def line_width_px(
             lowest = lowest_code_above(threshold, DARK_UNIT, level)
             if min(int(highest[r]), saturation) < lowest:
                 continue
-            found = row_peaks(image[r], lowest, GRAIN_PX, np.inf, saturation, DARK_UNIT, level, base, shape, height)
+            found = row_peaks(image[r], lowest, 0.0, GRAIN_PX, saturation, DARK_UNIT, level, base, shape, height)
             best = int(np.argmax(height[:found]))
             heights.append(float(height[best]))
-            widths.append(float(shape[best, 1]))
+            first, last = int(base[best, 0]), int(base[best, 1])
+            centre = centre_of_gravity(image[r], first, last, saturation, DARK_UNIT, level)
+            lit = np.maximum(np.minimum(image[r].astype(np.float64), saturation) - dark, 0.0)
+            seen.append((lit, float(centre), last - first + 1))
     if len(heights) < FEWEST_ROWS:
         return None
-    tall = np.asarray(heights) >= 0.25 * np.percentile(heights, 90)
-    return float(np.median(np.asarray(widths)[tall]))
+    tall = np.flatnonzero(np.asarray(heights) >= 0.25 * np.percentile(heights, 90))
+    reach = 2 * int(np.median([seen[i][2] for i in tall])) + 2
+    around = np.arange(-reach, reach + 1, 0.25)
+    mean = np.zeros(around.size)
+    for i in tall:
+        lit, centre, _ = seen[i]
+        mean += np.interp(centre + around, np.arange(lit.size), lit / lit.sum(), left=0.0, right=0.0)
+    whole = np.rint(mean / mean.max() * 1e6).astype(np.int64)
+    left, right = half_width(whole, 0, whole.size - 1, np.int64(1_000_000), INT64_TOP, 1, 0)
+    return float(right - left) * 0.25
 
 
 def best_exposure(steps: Sequence[Sequence[Image]], darks: Sequence[float], saturation: int) -> int:

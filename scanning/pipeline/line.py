@@ -9,20 +9,22 @@ width, and being where the line was in the row before.
    tenth of the maximum. k times the mean is cut at ``ceiling`` x the mean of all row maxima, because in a narrow or
    bright image it would rise above the line itself. A peak starts where the row rises above the threshold (strictly)
    and ends where it falls to it, at the last column, or where the gradient turns from negative to positive: at that
-   valley pixel, which still belongs to it. On flat stretches the last gradient that was not zero counts. Coherent light makes grains of the line, so taken
-   literally a "peak" is often one grain of it: neighbouring peaks no more than ``grain_px`` pixels apart are one, as
-   long as their common base is no wider than ``grain_span`` x the line. Measured on coherent speckle (f/5.6, 160
-   columns, one exposure): sigma 15.6 um and response slope 0.73-0.89 literally, 8.1 um and 0.99-1.00 joined.
+   valley pixel, which still belongs to it. On flat stretches the last gradient that was not zero counts.
+   Coherent light makes grains of the line, so taken literally a "peak" is often one grain of it. Neighbouring peaks
+   no more than ``grain_px`` pixels apart are one; a ghost wider than the line becomes one wide peak that way and
+   fails the width check. Measured on coherent speckle (f/5.6, 160 columns, one exposure): sigma 15.6 um and response
+   slope 0.73-0.89 literally, 8.1 um and 0.99-1.00 joined.
+   A peak no higher than ``snr`` x the noise of a pixel is noise.
    A peak has a base (first to last pixel), a height (maximum), a width (full width at half its height, interpolated;
    where the base ends above half height, the base's edge) and a position (the middle of that width).
 2. Seed. From the bottom row, the first row whose peak passes the width check and is alone in its row: no better signal
    to noise. If no such row exists, the row with the largest ratio between a peak that passes and the highest other one.
 3. Continuity. From the seed upwards and downwards, the candidate with the least |width change| + |column change|,
    ties to the lower column, within gate_px (1 + rows missed), at most gate_max_px. Rows without one do not end it.
-4. ``seed = "longest"``: the literal rule loses the whole frame when the lowest lone peak is a reflection. The line
-   followed from it is therefore only taken when it passes the width check in more than half of the rows that have
-   any peak; otherwise further lone peaks, then any peaks that pass, are tried (at most 32 lines) and the line with
-   most rows passing wins. Whenever the literal line is long, both give the same.
+4. ``seed = "best"``: the literal rule loses the whole frame when the lowest lone peak is a reflection. So lines from
+   other seeds are followed too (lone peaks first, bottom up, then any that pass; at most 16), and the line that looks
+   most like the line over most rows wins: the sum over its rows of 1 - |log(width / expected)| / log(width_factor),
+   not below 0. Where nothing else is in the image this ends after the literal line.
 
 All numbers are relative to the light of the frame: twice the light gives the same line.
 """
@@ -37,7 +39,11 @@ from scanning.pipeline.grey import grey
 
 BLOCK = 64
 """Columns looked at together: a block without a pixel above the threshold is skipped whole."""
-LINES_TRIED = 32
+LINES_TRIED = 16
+NOISE_PLACES = 1024
+SPREAD = 2_654_435_761
+"""Multiples of this prime, wrapped, fall all over the image and never in step with its columns."""
+NOISE_PER_STEP = 1.4826 / np.sqrt(2.0)
 TIE = 1e-9
 """Costs closer than this (px) are equal; rounding must not decide between two equal candidates."""
 STRICT = 1.0 + 1e-12
@@ -106,11 +112,11 @@ def half_width(row, first, last, height, top, scale, dark):  # type: ignore[no-u
 
 
 @nb.njit(cache=True, nogil=True)
-def row_peaks(row, lowest, grain_px, span_px, top, scale, dark, base, shape, height):  # type: ignore[no-untyped-def]
+def row_peaks(row, lowest, faint, grain_px, top, scale, dark, base, shape, height):  # type: ignore[no-untyped-def]
     """Find the peaks of one row, from low to high columns; return how many.
 
-    ``lowest`` is the smallest code above the threshold. Written per peak: base (first, last), shape (position, width)
-    in px, height in light.
+    ``lowest`` is the smallest code above the threshold; peaks no higher than ``faint`` are left out. Written per peak:
+    base (first, last), shape (position, width) in px, height in light.
     """
     columns = row.size
     found = 0
@@ -145,7 +151,7 @@ def row_peaks(row, lowest, grain_px, span_px, top, scale, dark, base, shape, hei
             joins = False
             if found > 0 and grain_px > 0.0:
                 apart = first - base[found - 1, 1] - 1
-                joins = apart <= grain_px and c - base[found - 1, 0] <= span_px
+                joins = apart <= grain_px
             if joins:
                 base[found - 1, 1] = c - 1
                 height[found - 1] = max(height[found - 1], most_light)
@@ -154,11 +160,16 @@ def row_peaks(row, lowest, grain_px, span_px, top, scale, dark, base, shape, hei
                 base[found, 1] = c - 1
                 height[found] = most_light
                 found += 1
+    kept = 0
     for k in range(found):
+        if height[k] > faint:
+            base[kept, 0], base[kept, 1], height[kept] = base[k, 0], base[k, 1], height[k]
+            kept += 1
+    for k in range(kept):
         left, right = half_width(row, base[k, 0], base[k, 1], height[k], top, scale, dark)
         shape[k, 0] = 0.5 * (left + right)
         shape[k, 1] = right - left
-    return found
+    return kept
 
 
 @nb.njit(cache=True, nogil=True)
@@ -211,65 +222,95 @@ def best_ratio_seed(counts, shape, height, narrowest, widest):  # type: ignore[n
 
 
 @nb.njit(cache=True, nogil=True)
-def find_line(counts, shape, height, narrowest, widest, gate_px, gate_max_px, longest, chosen):  # type: ignore[no-untyped-def]
-    """Choose the peak of every row that is the laser line; all -1 when no peak passes the width check."""
+def likeness(width, expected, factor):  # type: ignore[no-untyped-def]
+    """How much a peak of this width looks like the line: 1 at the expected width, 0 where the width check ends."""
+    if np.isinf(factor):
+        return 1.0
+    if factor <= 1.0:
+        return 1.0 if width == expected else 0.0
+    return max(0.0, 1.0 - abs(np.log(width / expected)) / np.log(factor))
+
+
+@nb.njit(cache=True, nogil=True)
+def visit(line, shape, expected, factor, visited):  # type: ignore[no-untyped-def]
+    """(sum of likeness over the rows of this line, how many of its peaks were not on a line before)."""
+    total = 0.0
+    fresh = 0
+    for q in range(line.size):
+        if line[q] >= 0:
+            total += likeness(shape[q, line[q], 1], expected, factor)
+            if not visited[q, line[q]]:
+                visited[q, line[q]] = True
+                fresh += 1
+    return total, fresh
+
+
+@nb.njit(cache=True, nogil=True)
+def find_line(counts, shape, height, expected, factor, gate_px, gate_max_px, best_seed, chosen):  # type: ignore[no-untyped-def]
+    """Choose the peak of every row that is the laser line; all -1 when no peak passes the width check.
+
+    ``expected`` width in px, and the factor it may be off; an infinite factor lets every width pass.
+    """
     rows = counts.size
+    narrowest, widest = expected / factor, expected * factor
     chosen[:] = -1
-    rows_with_peaks = 0
-    for r in range(rows):
-        if counts[r] > 0:
-            rows_with_peaks += 1
-    tried = 0
-    most_passing = 0
-    visited = np.zeros(height.shape, np.bool_) if longest else np.zeros((1, 1), np.bool_)
-    line = np.empty(rows, chosen.dtype)
+    seed_row, seed_peak = -1, -1
+    for r in range(rows - 1, -1, -1):
+        if counts[r] == 1 and narrowest <= shape[r, 0, 1] <= widest:
+            seed_row, seed_peak = r, 0
+            break
+    if seed_row < 0:
+        seed_row, seed_peak = best_ratio_seed(counts, shape, height, narrowest, widest)
+    if seed_row < 0:
+        return
+    follow(counts, shape, seed_row, seed_peak, gate_px, gate_max_px, chosen)
+    if not best_seed:
+        return
+    # The literal line is there; is another one more like the line, over more rows?
+    visited = np.zeros(height.shape, np.bool_)
+    most, fresh = visit(chosen, shape, expected, factor, visited)
+    unvisited = counts.sum() - fresh
+    tried = 1
+    line = np.empty_like(chosen)
     for alone in (True, False):
-        if not alone and tried == 0:
-            # No row with a lone peak: the best ratio is the literal seed, and the first to be tried.
-            r, k = best_ratio_seed(counts, shape, height, narrowest, widest)
-            if r < 0:
-                return
-            follow(counts, shape, r, k, gate_px, gate_max_px, chosen)
-            if not longest:
-                return
-            tried = 1
-            for q in range(rows):
-                if chosen[q] >= 0:
-                    visited[q, chosen[q]] = True
-                    if narrowest <= shape[q, chosen[q], 1] <= widest:
-                        most_passing += 1
-            if 2 * most_passing > rows_with_peaks:
-                return
         for r in range(rows - 1, -1, -1):
             if alone and counts[r] != 1:
                 continue
             for k in range(counts[r]):
-                if not narrowest <= shape[r, k, 1] <= widest:
-                    continue
-                if not longest:
-                    follow(counts, shape, r, k, gate_px, gate_max_px, chosen)
+                if unvisited <= most or tried >= LINES_TRIED:
                     return
-                if visited[r, k]:
+                if visited[r, k] or not narrowest <= shape[r, k, 1] <= widest:
                     continue
                 follow(counts, shape, r, k, gate_px, gate_max_px, line)
-                passing = 0
-                for q in range(rows):
-                    if line[q] >= 0:
-                        visited[q, line[q]] = True
-                        if narrowest <= shape[q, line[q], 1] <= widest:
-                            passing += 1
-                if passing > most_passing:
-                    most_passing = passing
-                    chosen[:] = line
+                total, fresh = visit(line, shape, expected, factor, visited)
+                unvisited -= fresh
                 tried += 1
-                if 2 * most_passing > rows_with_peaks or tried >= LINES_TRIED:
-                    return
+                if total > most + TIE:
+                    most = total
+                    chosen[:] = line
+
+
+@nb.njit(cache=True, nogil=True)
+def noise_of(image, top, scale):  # type: ignore[no-untyped-def]
+    """Noise of a pixel (standard deviation, in light): 1.4826 / sqrt 2 x the median step between neighbouring columns.
+
+    The median over 1024 places spread over the image does not see the line, which covers a small part of it.
+    """
+    rows, columns = image.shape
+    places = rows * (columns - 1)
+    count = min(places, NOISE_PLACES)
+    steps = np.empty(count, np.int64)
+    for i in range(count):
+        place = (i * SPREAD) % places
+        r, c = place // (columns - 1), place % (columns - 1)
+        steps[i] = abs(min(np.int64(image[r, c + 1]), top) - min(np.int64(image[r, c]), top))
+    return NOISE_PER_STEP * np.partition(steps, count // 2)[count // 2] * scale
 
 
 @nb.njit(cache=True, nogil=True)
 def extract_line(  # type: ignore[no-untyped-def]
-    image, top, scale, dark, k, floor, from_row_mean, ceiling, grain_px, span_px, narrowest, widest, gate_px,
-    gate_max_px, longest,
+    image, top, scale, dark, k, floor, from_row_mean, ceiling, snr, grain_px, expected, factor, gate_px,
+    gate_max_px, best_seed,
     highest, light, base, shape, height, counts, chosen, column_px, peak, width_px,
 ):  # fmt: skip
     """MSNN then COG on one (rows, columns) image of integer codes (see `grey.grey` for top, scale, dark).
@@ -287,14 +328,15 @@ def extract_line(  # type: ignore[no-untyped-def]
         for r in range(rows):
             of_maxima += grey(highest[r], top, scale, dark)
         asked = min(asked, ceiling * (of_maxima / rows))
+    faint = snr * noise_of(image, top, scale) * STRICT if snr > 0.0 else 0.0
     for r in range(rows):
         background = light[r] / columns if from_row_mean else 0.0
         threshold = max(asked, background + floor * (grey(highest[r], top, scale, dark) - background))
         lowest = lowest_code_above(threshold, scale, dark)
         counts[r] = 0
         if min(np.int64(highest[r]), top) >= lowest:
-            counts[r] = row_peaks(image[r], lowest, grain_px, span_px, top, scale, dark, base[r], shape[r], height[r])
-    find_line(counts, shape, height, narrowest, widest, gate_px, gate_max_px, longest, chosen)
+            counts[r] = row_peaks(image[r], lowest, faint, grain_px, top, scale, dark, base[r], shape[r], height[r])
+    find_line(counts, shape, height, expected, factor, gate_px, gate_max_px, best_seed, chosen)
     for r in range(rows):
         peak_of_row = chosen[r]
         if peak_of_row < 0:

@@ -32,6 +32,8 @@ FIRST_STEPS = 5
 """Stage positions looked at before the first profile when something must be estimated."""
 RAW_FLOOR = 0.1
 LOGARITHMIC_FLOOR = 0.6
+RAW_SNR, COMPRESSED_SNR = 4.0, 3.0
+GRAIN_PX = 3.0
 INT32_TOP = (1 << 31) - 1
 Progress = Callable[[int, int], None]
 Float64 = NDArray[np.float64]
@@ -73,6 +75,8 @@ class Settled:
     expected_width_px: float | None
     k: float
     floor: float
+    snr: float
+    grain_px: float
     estimated: tuple[str, ...]
 
 
@@ -223,6 +227,8 @@ class ProfileStream:
             expected_width_px=expected,
             k=k,
             floor=floor,
+            snr=line.snr if line.snr is not None else (COMPRESSED_SNR if compressed else RAW_SNR),
+            grain_px=line.grain_px if line.grain_px is not None else max(GRAIN_PX, (expected or 0.0) / 4.0),
             estimated=tuple(estimated),
         )
         self._chain = _Chain(self.recipe, h, self.settled, selected)
@@ -245,6 +251,8 @@ class ProfileStream:
             "expected_width_px": None if settled is None else settled.expected_width_px,
             "threshold_k": None if settled is None else settled.k,
             "threshold_floor": None if settled is None else settled.floor,
+            "threshold_snr": None if settled is None else settled.snr,
+            "grain_px": None if settled is None else settled.grain_px,
             "estimated": [] if settled is None else list(settled.estimated),
             "notes": notes,
             "versions": {
@@ -315,11 +323,10 @@ class _Chain:
 
         width = settled.expected_width_px
         self._line = (
-            settled.k, settled.floor, line.floor_from == "row_mean", line.ceiling,
-            line.grain_px, np.inf if width is None else line.grain_span * width,
-            0.0 if width is None else width / line.width_factor,
-            np.inf if width is None else width * line.width_factor,
-            line.gate_px, line.gate_max_px, line.seed == "longest",
+            settled.k, settled.floor, line.floor_from == "row_mean", line.ceiling, settled.snr,
+            settled.grain_px,
+            1.0 if width is None else width, np.inf if width is None else line.width_factor,
+            line.gate_px, line.gate_max_px, line.seed == "best",
         )  # fmt: skip
         most = columns // 2 + 1
         self._scratch = (

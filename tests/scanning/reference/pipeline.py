@@ -36,12 +36,12 @@ class Setting:
     floor_from_row_mean: bool = True
     ceiling: float = 0.5
     grain: float = 0.0  # px between two grains of one line
-    span: float = math.inf  # px, widest base of joined grains
     width: float | None = None  # as the image shows it
     width_factor: float = 2.0
     gate: float = 12.0
     gate_max: float = 64.0
-    seed: str = "longest"
+    snr: float = 4.0
+    seed: str = "best"
 
 
 def quantised(grey: Array, window: int) -> Array:
@@ -74,7 +74,7 @@ def windows(steps: int, s: Setting) -> list[range]:
 
 
 def grey_images(stack: list[list[NDArray[Any]]], s: Setting) -> list[Array]:
-    """The image MSNN sees, per profile; black level already off."""
+    """The image MSNN sees, per profile; black level already off, so camera noise may be negative."""
     out = []
     window = s.window if "sci" in s.order else 1
     for span in windows(len(stack), s):
@@ -107,7 +107,7 @@ def grey_images(stack: list[list[NDArray[Any]]], s: Setting) -> list[Array]:
                 g = 255.0 * np.maximum(means[0] - s.dark, 0.0) / (s.saturation - s.dark)
                 image = quantised(eq_7(g, s.p), window)
             else:
-                image = np.maximum(means[0] - s.dark, 0.0)
+                image = means[0] - s.dark  # the noise is measured before it is cut at black
         out.append(image)
     return out
 
@@ -129,7 +129,7 @@ class Peak:
         return (self.left + self.right) / 2
 
 
-def peaks_of_row(row: Array, threshold: float, s: Setting) -> list[Peak]:
+def peaks_of_row(row: Array, threshold: float, faint: float, s: Setting) -> list[Peak]:
     P = row  # noqa: N806 - the letter of eq. (8)
     above = threshold * STRICT < P
     peaks: list[Peak] = []
@@ -156,6 +156,7 @@ def peaks_of_row(row: Array, threshold: float, s: Setting) -> list[Peak]:
         c = end + 1
     if s.grain > 0:
         peaks = grains_joined(peaks, s)
+    peaks = [peak for peak in peaks if peak.height > faint]
     for peak in peaks:
         half = peak.height / 2
         higher = [i for i in range(peak.first, peak.last + 1) if P[i] > half]
@@ -175,8 +176,7 @@ def grains_joined(peaks: list[Peak], s: Setting) -> list[Peak]:
         if joined:
             before = joined[-1]
             dark_between = peak.first - before.last - 1
-            base = peak.last - before.first + 1
-            if dark_between <= s.grain and base <= s.span:
+            if dark_between <= s.grain:
                 joined[-1] = Peak(before.first, peak.last, max(before.height, peak.height))
                 continue
         joined.append(peak)
@@ -227,27 +227,48 @@ def the_line(rows: list[list[Peak]], s: Setting) -> list[int]:
     seeds = lone or [best_ratio[1:]]
     if s.seed == "first":
         return followed(rows, *seeds[0], s)
-    seeds = seeds + [(r, k) for r in bottom_up for k in range(len(rows[r])) if passes(rows[r][k], s)]
+    seeds = seeds + lone + [(r, k) for r in bottom_up for k in range(len(rows[r])) if passes(rows[r][k], s)]
+    everything = sum(len(peaks) for peaks in rows)
+    first = followed(rows, *seeds[0], s)
     visited: set[tuple[int, int]] = set()
-    best, most, tried = none, 0, 0
-    with_peaks = sum(1 for peaks in rows if peaks)
+    best, most, tried = first, -1.0, 0
     for seed in seeds:
         if seed in visited:
             continue
+        if tried and (tried >= 16 or everything - len(visited) <= most):
+            break
         line = followed(rows, *seed, s)
         on_line = [(r, k) for r, k in enumerate(line) if k >= 0]
         visited |= set(on_line)
-        score = sum(1 for r, k in on_line if passes(rows[r][k], s))
-        if score > most:
+        score = sum(likeness(rows[r][k].width, s) for r, k in on_line)
+        if score > most + TIE:
             best, most = line, score
         tried += 1
-        if 2 * most > with_peaks or tried == 32:
-            break
     return best
+
+
+def likeness(width: float, s: Setting) -> float:
+    if s.width is None:
+        return 1.0
+    if s.width_factor == 1:
+        return float(width == s.width)
+    return max(0.0, 1 - abs(math.log(width / s.width)) / math.log(s.width_factor))
+
+
+def noise_of(image: Array) -> float:
+    rows, columns = image.shape
+    places = rows * (columns - 1)
+    at = [(i * 2654435761) % places for i in range(min(places, 1024))]
+    steps = sorted(
+        abs(image[p // (columns - 1), p % (columns - 1) + 1] - image[p // (columns - 1), p % (columns - 1)]) for p in at
+    )
+    return float(1.4826 / math.sqrt(2) * steps[len(steps) // 2])
 
 
 def profile(image: Array, s: Setting) -> Array:
     """MSNN and eq. (8) on one image whose black level is off; NaN where there is no line."""
+    faint = s.snr * noise_of(image) * STRICT
+    image = np.maximum(image, 0.0)
     maxima = image.max(axis=1)
     asked = s.k * image.mean()
     if s.ceiling > 0:
@@ -255,7 +276,7 @@ def profile(image: Array, s: Setting) -> Array:
     rows = []
     for P in image:  # noqa: N806
         background = P.mean() if s.floor_from_row_mean else 0.0
-        rows.append(peaks_of_row(P, max(asked, background + s.floor * (P.max() - background)), s))
+        rows.append(peaks_of_row(P, max(asked, background + s.floor * (P.max() - background)), faint, s))
     out = np.full(len(rows), np.nan)
     for r, k in enumerate(the_line(rows, s)):
         if k >= 0:
