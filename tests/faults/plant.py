@@ -116,3 +116,5 @@ def plant() -> Iterator[Plant]:
             yield made
         finally:
             made.stop()
+            for log in sorted(made.folder.glob("*.log")):  # shown by pytest when the test fails
+                print(f"--- {log.name}\n{log.read_text(errors='replace')[-6000:]}")
