@@ -261,8 +261,6 @@ def follow_rims(
     """
     labels = detection.labels.copy()
     for number, place in enumerate(ndimage.find_objects(detection.labels), start=1):
-        if place is None:
-            continue
         crop = _widen(place, FURTHEST_RING_UM, row_pitch_um, profile_pitch_um, labels.shape)
         mask = detection.labels[crop] == number
         distance = ndimage.distance_transform_edt(~mask, sampling=(row_pitch_um, profile_pitch_um))
@@ -292,8 +290,6 @@ def owners(detection: Detection, row_pitch_um: float, profile_pitch_um: float) -
     sizes = np.bincount(detection.labels.ravel(), minlength=detection.count + 1)
     for number in sorted(range(1, detection.count + 1), key=lambda n: -int(sizes[n])):
         place = places[number - 1]
-        if place is None:
-            continue
         reach = detection.reach_um[number - 1]
         crop = _widen(place, reach, row_pitch_um, profile_pitch_um, owner.shape)
         grown = dilate(detection.labels[crop] == number, reach, row_pitch_um, profile_pitch_um)
@@ -340,9 +336,7 @@ def findings(
     owner = owners(detection, row_pitch_um, profile_pitch_um)
     open_pixels = lost_at_edge(valid, expected)
     places = ndimage.find_objects(detection.labels)
-    order = sorted(
-        (place[1].start, place[0].start, number) for number, place in enumerate(places, start=1) if place is not None
-    )
+    order = sorted((place[1].start, place[0].start, number) for number, place in enumerate(places, start=1))
     new_labels = np.zeros_like(detection.labels)
     found: list[DamageFinding] = []
     for _, _, old in order:
@@ -368,9 +362,7 @@ def findings(
         extended, _ = _interpolated(depth, density, at_edge, mask, lost[crop], valid[crop])
         volume = lower + filled * pixel_area * 1e-9
         open_mm3 = extended * pixel_area * 1e-9
-        u_volume = budget.volume_mm3(
-            volume, int(np.count_nonzero(measured)), pixel_area, u_filled * pixel_area * 1e-9
-        )
+        u_volume = budget.volume_mm3(volume, int(np.count_nonzero(measured)), pixel_area, u_filled * pixel_area * 1e-9)
 
         judged = mask & valid[crop] & (density >= LEAST_DENSITY)
         if not judged.any():
@@ -534,9 +526,7 @@ def excess_of_largest(
     largest = np.empty(NOISE_DRAWS)
     scale = sigma_um / math.sqrt(float(np.sum(kernel[0] ** 2)) * float(np.sum(kernel[1] ** 2)))
     for draw in range(NOISE_DRAWS):
-        white = rng.standard_normal(
-            (core.shape[0] + 2 * margin[0], core.shape[1] + 2 * margin[1]), dtype=np.float32
-        )
+        white = rng.standard_normal((core.shape[0] + 2 * margin[0], core.shape[1] + 2 * margin[1]), dtype=np.float32)
         noise = cv2.sepFilter2D(white, cv2.CV_32F, kernel[1], kernel[0])
         noise = noise[margin[0] : margin[0] + core.shape[0], margin[1] : margin[1] + core.shape[1]] * scale
         largest[draw] = float((core + noise)[inside].max())

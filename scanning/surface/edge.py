@@ -31,9 +31,10 @@ class Edge:
 
     ``row`` is the last sound row (sub-pixel), ``reference_row`` the line through the undamaged edge, ``recession_um``
     the distance between them, positive where material is gone. ``outermost_row`` is the line where the light ends: a
-    rounded edge or the floor of a chip is still seen there. ``undamaged`` marks profiles whose edge is on the line. ``side`` says at which end of the rows the edge is.
-    ``sigma_um`` is the scatter of single edge points about the line; ``rounded_um`` the distance from the edge at
-    which the surface meets the bevel again, 0 when it is sharp to the last row.
+    rounded edge or the floor of a chip is still seen there. ``undamaged`` marks profiles whose edge is on the line.
+    ``side`` says at which end of the rows the edge is. ``sigma_um`` is the scatter of single edge points from
+    neighbour to neighbour; ``rounded_um`` the distance from the end of the light at which the undamaged surface
+    meets the bevel again, 0 when it is sharp to the last row.
     """
 
     side: Literal["first", "last"]
@@ -208,7 +209,7 @@ def _band(body: Mask, end: str) -> Float64:
     seen = body if end == "first" else body[::-1]
     first = np.argmax(seen, axis=0).astype(np.float64)
     first[~seen.any(axis=0)] = body.shape[0]
-    return first
+    return np.asarray(first, dtype=np.float64)
 
 
 def _last_row(body: Mask, height: Float32, limit: float) -> Float64:
@@ -222,9 +223,9 @@ def _last_row(body: Mask, height: Float32, limit: float) -> Float64:
     here, there = height[index, found].astype(np.float64), height[beyond, found].astype(np.float64)
     dips = np.isfinite(there) & (there < -limit) & (here > -limit)
     fraction = np.full(found.size, 0.5)
-    fraction[dips] = ((here + limit) / (here - there))[dips]
+    fraction[dips] = (here + limit)[dips] / (here - there)[dips]
     row[found] = index + np.clip(fraction, 0.0, 1.0)
-    return row
+    return np.asarray(row, dtype=np.float64)
 
 
 def _point_scatter(row: Float64) -> float:
@@ -247,8 +248,7 @@ def _reference(row: Float64, outline: Float64) -> Float64 | None:
     outer = float(np.percentile(distance[good], 95.0))
     cluster = good & (distance >= outer - 4.0 * _point_scatter(row))
     if np.count_nonzero(cluster) >= 0.7 * row.size:
-        own = _fitted(np.where(cluster, row, np.nan), 50.0)
-        return own
+        return _fitted(np.where(cluster, row, np.nan), 50.0)
     return direction + float(np.median(distance[cluster]))
 
 

@@ -48,7 +48,7 @@ def gaussian_kernel(sigma_px: float) -> Float32:
     reach = max(0, math.ceil(KERNEL_REACH * sigma_px - 0.5)) if sigma_px > 0.15 else 0
     offset = np.arange(-reach, reach + 1, dtype=np.float64)
     weights = np.exp(-0.5 * (offset / max(sigma_px, 1e-6)) ** 2)
-    return (weights / weights.sum()).astype(np.float32)
+    return np.asarray(weights / weights.sum(), dtype=np.float32)
 
 
 def _separable(image: Float32, kernel_rows: Float32, kernel_profiles: Float32) -> Float32:
@@ -72,7 +72,8 @@ def smooth(values: Float32, valid: Mask, sigma_px: tuple[float, float]) -> Smoot
     seen = density > 1e-4
     safe = np.where(seen, density, np.float32(1.0))
     value = np.where(seen, total / safe, np.float32(np.nan)).astype(np.float32)
-    spread = np.where(seen, np.sqrt(np.maximum(squares, 0.0) / open_field) / safe, np.float32(np.inf))
+    # Where nothing was seen the value is NaN already; a finite spread keeps arithmetic on the image quiet.
+    spread = np.where(seen, np.sqrt(np.maximum(squares, 0.0) / open_field) / safe, np.float32(1e3))
     return Smoothed(value=value, density=density, spread=np.maximum(spread, 1.0).astype(np.float32))
 
 
@@ -85,9 +86,9 @@ def ellipse(reach_um: float, row_pitch_um: float, profile_pitch_um: float) -> ND
     """Structuring element of all pixels whose centre lies within ``reach_um`` of its own, one pixel at least."""
     half_rows, half_profiles = max(reach_um, row_pitch_um), max(reach_um, profile_pitch_um)
     rows = np.arange(-int(half_rows / row_pitch_um), int(half_rows / row_pitch_um) + 1) * row_pitch_um / half_rows
-    profiles = np.arange(-int(half_profiles / profile_pitch_um), int(half_profiles / profile_pitch_um) + 1)
-    profiles = profiles * profile_pitch_um / half_profiles
-    return (rows[:, None] ** 2 + profiles[None, :] ** 2 <= 1.0 + 1e-9).astype(np.uint8)
+    reach = int(half_profiles / profile_pitch_um)
+    profiles = np.arange(-reach, reach + 1) * profile_pitch_um / half_profiles
+    return np.asarray(rows[:, None] ** 2 + profiles[None, :] ** 2 <= 1.0 + 1e-9, dtype=np.uint8)
 
 
 def dilate(mask: Mask, reach_um: float, row_pitch_um: float, profile_pitch_um: float) -> Mask:
@@ -121,10 +122,10 @@ def wild_pixels(
 ) -> Mask:
     """Find isolated wrong heights: a wrong peak taken in one row, or one profile that jumped.
 
-    A pixel is wild when it stands more than 6 noise standard deviations off the median of its 5 x 5 surroundings, at
-    most two of its eight neighbours agree with it, and the group it belongs to is smaller than anything the optics
-    can resolve (25 um, the width of the laser line, in one direction, or 4 pixels in all). The corner of a real pit
-    has three agreeing neighbours and stays; a groove narrower than the laser line is not measurable and goes.
+    A pixel is wild when it stands more than 6 noise standard deviations off the median of its 5 x 5 surroundings and
+    at most one of its eight neighbours agrees with it; with two, when the group it belongs to is smaller than
+    anything the optics can resolve (25 um, the width of the laser line, in one direction, or 4 pixels in all). The
+    corner of a real pit has three agreeing neighbours and stays; a one-profile groove is not measurable and goes.
     """
     tolerance = np.float32(6.0 * noise_um)
     around = smooth(residual_um, valid, (1.5, 1.5)).value
@@ -132,7 +133,7 @@ def wild_pixels(
     median = cv2.medianBlur(filled, 5)
     candidate = valid & (np.abs(filled - median) > tolerance)
     if not candidate.any():
-        return candidate
+        return np.asarray(candidate)
     rows, profiles = np.nonzero(candidate)
     padded = np.pad(np.where(valid, residual_um, np.float32(np.nan)), 1, constant_values=np.nan)
     own = residual_um[rows, profiles]
@@ -144,14 +145,13 @@ def wild_pixels(
                 agreeing += np.abs(other - own) <= tolerance
     lonely = np.zeros_like(candidate)
     lonely[rows[agreeing <= 2], profiles[agreeing <= 2]] = True
-    labels, _ = label(lonely)
     wild = np.zeros_like(candidate)
+    wild[rows[agreeing < 2], profiles[agreeing < 2]] = True
+    labels, _ = label(lonely)
     for number, place in enumerate(ndimage.find_objects(labels), start=1):
-        if place is None:
-            continue
         group = labels[place] == number
         height_um = group.shape[0] * row_pitch_um
         width_um = group.shape[1] * profile_pitch_um
         if np.count_nonzero(group) <= 4 or min(height_um, width_um) <= 25.0:
             wild[place] |= group
-    return wild
+    return np.asarray(wild)

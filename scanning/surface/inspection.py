@@ -8,142 +8,32 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanning.errors import BadInput
 from scanning.range_image import RangeImage
-from scanning.surface.damage import (
-    DamageFinding,
-    Detection,
-    detect,
-    findings,
-    lost_at_edge,
-    owners,
-)
-from scanning.surface.edge import Edge, distance_to_edge_um, expected_surface, find_edge, roll_off
+from scanning.surface.damage import DamageFinding, detect, findings, lost_at_edge
+from scanning.surface.edge import distance_to_edge_um, expected_surface, find_edge, roll_off
 from scanning.surface.filters import Float32, Float64, Mask, dilate, label, wild_pixels
 from scanning.surface.noise import Noise, local_noise, measure_noise, robust_sigma
-from scanning.surface.plane import Plane, fit_plane
+from scanning.surface.numbers import burr_numbers, damage_numbers, edge_numbers, quality_numbers, roughness_numbers
+from scanning.surface.plane import fit_plane
 from scanning.surface.registration import Registration, check_comparable, find_shift, resample
+from scanning.surface.report import SurfaceReport
 from scanning.surface.roughness import Roughness, nesting_indices, parameters, scale_limited
 from scanning.surface.settings import InspectionSettings
-from scanning.surface.uncertainty import Budget, budget
+from scanning.surface.uncertainty import budget
 
 #: The roughness patch keeps this distance from damage and from the edge.
 KEEP_AWAY_UM = 100.0
-#: Below this ratio to the instrument's noise a roughness is not resolvable.
-RESOLVABLE = 1.5
+#: Scatter of single heights above which the heights themselves are in doubt.
+LOUD_UM = 50.0
+#: A damage across the whole bevel narrower than this is remarked on.
+ACROSS_MM = 0.1
 #: Smallest group of undefined pixels at the edge worth a remark: length along the edge, depth behind the line.
 REMARK_LOST_UM = (100.0, 50.0)
-
-
-@dataclass(frozen=True)
-class Measurement:
-    """One number: code and label, value (None when it cannot be known), unit, standard uncertainty in the same unit.
-
-    ``source`` says in one sentence (at most 300 characters) where the number came from and which uncertainty inputs
-    were unknown. ``scope`` is "region", or "damage n".
-    """
-
-    code: str
-    label: str
-    value: float | None
-    unit: str
-    u: float | None
-    source: str
-    scope: str = "region"
-
-
-@dataclass(frozen=True)
-class SurfaceReport:
-    """Everything found on one surface. Arrays are (rows, profiles) of the image as it was given.
-
-    ``residual_um`` is height minus reference (plane, or plane and baseline), positive out of the material, NaN where
-    not measured or not trusted. ``damage_labels`` holds the damage number per pixel, 0 elsewhere. ``edge_um`` is the
-    edge recession per position along the edge, None without an edge.
-    """
-
-    measurements: list[Measurement]
-    damages: list[DamageFinding]
-    plane: Plane
-    noise: Noise
-    edge: Edge | None
-    registration: Registration | None
-    roughness: Roughness | None
-    residual_um: Float32
-    damage_labels: NDArray[np.int32]
-    edge_um: Float64 | None
-    edge_pitch_um: float
-    settings: InspectionSettings
-    row_pitch_um: float
-    profile_pitch_um: float
-    warnings: list[str] = field(default_factory=list)
-
-    @property
-    def sigma_um(self) -> float:
-        """Robust standard deviation of single pixels about the reference, in um."""
-        return self.noise.sigma_um
-
-    @property
-    def kappa(self) -> float:
-        """Sum of the two-dimensional noise autocorrelation, measured from this image."""
-        return self.noise.kappa
-
-    @property
-    def damage_mask(self) -> Mask:
-        return np.asarray(self.damage_labels > 0)
-
-    def measurement(self, code: str) -> Measurement:
-        """Return the region's measurement of that code; KeyError when this surface has none."""
-        for one in self.measurements:
-            if one.code == code:
-                return one
-        raise KeyError(code)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the report without its images as plain JSON values; what is not known is null, never NaN."""
-        edge = None
-        if self.edge is not None:
-            edge = {
-                "side": self.edge.side,
-                "straightness_um": self.edge.straightness_um,
-                "sigma_um": self.edge.sigma_um,
-                "rounded_um": self.edge.rounded_um,
-                "points": self.edge.points,
-                "pitch_um": self.edge_pitch_um,
-                "recession_um": np.round(self.edge.recession_um, 2),
-            }
-        report: dict[str, Any] = {
-            "format": "edgewatch-surface/1",
-            "shape": list(self.residual_um.shape),
-            "row_pitch_um": self.row_pitch_um,
-            "profile_pitch_um": self.profile_pitch_um,
-            "sigma_um": self.sigma_um,
-            "kappa": self.kappa,
-            "noise": dataclasses.asdict(self.noise),
-            "plane": {
-                "offset_um": self.plane.offset_um,
-                "slope_rows_um_per_mm": self.plane.slope_rows_um_per_mm,
-                "slope_profiles_um_per_mm": self.plane.slope_profiles_um_per_mm,
-                "quadratic_um_per_mm2": list(self.plane.quadratic),
-                "inlier_fraction": self.plane.inlier_fraction,
-                "points": self.plane.points,
-                "start": self.plane.start,
-            },
-            "measurements": [dataclasses.asdict(one) for one in self.measurements],
-            "damages": [dataclasses.asdict(one) for one in self.damages],
-            "edge": edge,
-            "registration": dataclasses.asdict(self.registration) if self.registration else None,
-            "settings": self.settings.to_json(),
-            "warnings": list(self.warnings),
-        }
-        plain = _plain(report)
-        assert isinstance(plain, dict)
-        return plain
 
 
 def inspect_surface(
@@ -297,7 +187,7 @@ def _inspect(
         settings,
         figures,
     )
-    _remark(image, residual, valid, expected, labels, noise, settings, calibration, warnings)
+    _remark(image, residual, valid, expected, labels, damages, noise, settings, calibration, warnings)
 
     away = valid & ~dilate(touched, KEEP_AWAY_UM, row_pitch, profile_pitch)
     if distance is not None:
@@ -305,11 +195,11 @@ def _inspect(
     roughness = _roughness(residual, away, row_pitch, profile_pitch, settings)
 
     measurements = [
-        *_damage_numbers(damages, labels, valid, expected, profile_pitch, figures, settings),
-        *_burr_numbers(raised, residual, valid, row_pitch, profile_pitch, figures),
-        *_edge_numbers(edge, edge_reference is not None, profile_pitch, figures),
-        *_roughness_numbers(roughness, noise, instrument_noise, figures),
-        *_quality_numbers(image, valid, expected, plane, noise, row_pitch, profile_pitch),
+        *damage_numbers(damages, labels, valid, expected, profile_pitch, figures, settings),
+        *burr_numbers(raised, residual, valid, row_pitch, profile_pitch, figures),
+        *edge_numbers(edge, edge_reference is not None, profile_pitch, figures),
+        *roughness_numbers(roughness, noise, instrument_noise, figures),
+        *quality_numbers(image, valid, expected, plane, noise, row_pitch, profile_pitch),
     ]
     return SurfaceReport(
         measurements=measurements,
@@ -353,7 +243,7 @@ def _without_wild(residual: Float32, row_pitch: float, profile_pitch: float, war
         return residual
     if warnings is not None:
         warnings.append(
-            f"{count} isolated wild pixels ({100 * count / max(np.count_nonzero(valid), 1):.2f} % of the measured) "
+            f"{count} isolated wild pixels ({100 * count / max(int(np.count_nonzero(valid)), 1):.2f} % of the measured) "
             "were set aside: wrong peaks smaller than the laser line can resolve."
         )
     return np.where(wild, np.float32(np.nan), residual).astype(np.float32)
@@ -376,7 +266,7 @@ def _against_baseline(
     shape = (residual.shape[0], residual.shape[1])
     on_grid = resample(other, own_pitches, shape, pitches)
     both = np.isfinite(residual) & np.isfinite(on_grid)
-    check_comparable(shape, other.shape, np.count_nonzero(both) / max(np.count_nonzero(np.isfinite(residual)), 1))
+    check_comparable(shape, other.shape, np.count_nonzero(both) / max(int(np.count_nonzero(np.isfinite(residual))), 1))
     calm = both & (np.abs(residual) < 6.0 * robust_sigma(residual[both]))
     calm &= np.abs(on_grid) < 6.0 * max(robust_sigma(on_grid[both]), 1e-6)
     row, profile, correlation, ratio, accepted = find_shift(residual, on_grid, calm, *pitches)
@@ -398,7 +288,7 @@ def _against_baseline(
         accepted=accepted,
         correlation=correlation,
         peak_ratio=ratio,
-        overlap_share=float(np.count_nonzero(measured) / max(np.count_nonzero(np.isfinite(residual)), 1)),
+        overlap_share=float(np.count_nonzero(measured) / max(int(np.count_nonzero(np.isfinite(residual))), 1)),
         rms_um=robust_sigma(difference),
     )
     edge, _ = find_edge(other, np.isfinite(other), *own_pitches, side=settings.edge_side)
@@ -415,6 +305,7 @@ def _remark(
     valid: Mask,
     expected: Mask,
     labels: NDArray[np.int32],
+    damages: list[DamageFinding],
     noise: Noise,
     settings: InspectionSettings,
     calibration: object | None,
@@ -435,6 +326,18 @@ def _remark(
                 f"From {start:.2f} to {start + length / 1e3:.2f} mm along the edge nothing was measured over "
                 f"{depth:.0f} um behind the edge line: material is gone or no light came back. It counts as edge "
                 "recession, not as volume."
+            )
+    if noise.sigma_um > LOUD_UM:
+        warnings.append(
+            f"Single heights scatter by {noise.sigma_um:.0f} um, far more than a laser line on metal: most of them may "
+            "be wrong peaks. Look at the scan images before trusting any number here."
+        )
+    bevel_rows = np.count_nonzero(expected.any(axis=1))
+    for one in damages:
+        if one.rows[1] - one.rows[0] > 0.9 * bevel_rows and one.length_mm < ACROSS_MM:
+            warnings.append(
+                f"Damage {one.number} crosses the whole bevel but is only {1e3 * one.length_mm:.0f} um wide; a jump of "
+                "the stage looks the same. Scan again before acting on it."
             )
     if noise.shape_um > max(1.0, 0.5 * noise.sigma_um):
         warnings.append(
@@ -458,377 +361,7 @@ def _roughness(
     if np.count_nonzero(sound) < 500:
         return None
     s_index, l_index = nesting_indices(
-        *residual.shape, row_pitch, profile_pitch, settings.s_filter_um, settings.l_filter_um
+        residual.shape[0], residual.shape[1], row_pitch, profile_pitch, settings.s_filter_um, settings.l_filter_um
     )
     surface = scale_limited(residual, sound, row_pitch, profile_pitch, s_index, l_index)
     return parameters(surface, row_pitch, profile_pitch, s_index=s_index, l_index=l_index)
-
-
-def _damage_numbers(
-    damages: list[DamageFinding],
-    labels: NDArray[np.int32],
-    valid: Mask,
-    expected: Mask,
-    profile_pitch: float,
-    figures: Budget,
-    settings: InspectionSettings,
-) -> list[Measurement]:
-    length_mm = labels.shape[1] * profile_pitch / 1e3
-    volume = sum(one.volume_mm3 for one in damages)
-    # Noise is independent from damage to damage, the scale is common to all.
-    scale = figures.scale or 0.0
-    own = [math.sqrt(max(0.0, one.u_volume_mm3**2 - (one.volume_mm3 * scale) ** 2)) for one in damages]
-    u_volume = math.hypot(*own, volume * scale)
-    lower = sum(one.volume_lower_bound_mm3 for one in damages)
-    area = sum(one.area_mm2 for one in damages)
-    deepest = max(damages, key=lambda one: one.depth_um, default=None)
-    covered = float(np.count_nonzero((labels > 0).any(axis=0))) * profile_pitch / 1e3
-    found = f"{len(damages)} damages" if len(damages) != 1 else "1 damage"
-    u_zero = figures.noise.sigma_um
-    numbers = [
-        Measurement(
-            "V-",
-            "Missing volume",
-            volume,
-            "mm3",
-            u_volume,
-            f"Signed sum of the residual over the widened mask of {found}; {figures.sentence}.",
-        ),
-        Measurement(
-            "V-_lower",
-            "Missing volume, measured pixels only",
-            lower,
-            "mm3",
-            u_volume,
-            "As V-, without any undefined pixel: at least this much is gone.",
-        ),
-        Measurement(
-            "A",
-            "Damaged area",
-            area,
-            "mm2",
-            math.hypot(*(one.u_area_mm2 for one in damages)),
-            "Projected area of all damage masks, undefined pixels inside counted.",
-        ),
-        Measurement(
-            "d_max",
-            "Largest damage depth",
-            deepest.depth_um if deepest else 0.0,
-            "um",
-            deepest.u_depth_um if deepest else u_zero,
-            f"Deepest point of the residual smoothed with {settings.small_scale_um:g} um inside the damage masks"
-            + (f", damage {deepest.number}; " if deepest else "; no damage found; ")
-            + f"{figures.sentence}.",
-        ),
-        Measurement(
-            "n",
-            "Number of damages",
-            float(len(damages)),
-            "1",
-            None,
-            f"Connected areas beyond {settings.seed_k:g} standard deviations of the smoothed image, at least "
-            f"{settings.min_area_um2:g} um2, closer than {settings.join_um:g} um joined.",
-        ),
-        Measurement(
-            "n_10mm",
-            "Damages per 10 mm of edge",
-            10.0 * len(damages) / length_mm,
-            "1",
-            None,
-            f"n over {length_mm:.3f} mm of edge.",
-        ),
-        Measurement(
-            "cov",
-            "Damaged share of the edge",
-            100.0 * covered / length_mm,
-            "%",
-            100.0 * math.hypot(*(one.u_length_mm for one in damages)) / length_mm,
-            "Union of the damages' extents along the edge over its length.",
-        ),
-    ]
-    if damages:
-        longest = max(damages, key=lambda one: one.length_mm)
-        numbers += [
-            Measurement(
-                "L_max",
-                "Longest damage along the edge",
-                longest.length_mm,
-                "mm",
-                longest.u_length_mm,
-                f"Extent of damage {longest.number} along the edge.",
-            ),
-            Measurement(
-                "d_99",
-                "Damage depth, 99th percentile",
-                max(one.d99_um for one in damages),
-                "um",
-                deepest.u_depth_um if deepest else None,
-                f"Largest 99th percentile of the smoothed depth inside a damage mask; {figures.sentence}.",
-            ),
-            Measurement(
-                "d_mean",
-                "Mean damage depth",
-                volume / area * 1e3,
-                "um",
-                u_volume / area * 1e3,
-                f"V- over A; {figures.sentence}.",
-            ),
-        ]
-    for one in damages:
-        scope = f"damage {one.number}"
-        where = f"Damage {one.number} at {one.s_start_mm:.3f} to {one.s_end_mm:.3f} mm along the edge"
-        numbers += [
-            Measurement(
-                "V-", "Missing volume", one.volume_mm3, "mm3", one.u_volume_mm3, f"{where}; {figures.sentence}.", scope
-            ),
-            Measurement("d_max", "Depth", one.depth_um, "um", one.u_depth_um, f"{where}; {figures.sentence}.", scope),
-            Measurement("A", "Area", one.area_mm2, "mm2", one.u_area_mm2, f"{where}.", scope),
-            Measurement("L", "Length along the edge", one.length_mm, "mm", one.u_length_mm, f"{where}.", scope),
-        ]
-    return numbers
-
-
-def _burr_numbers(
-    raised: Detection, residual: Float32, valid: Mask, row_pitch: float, profile_pitch: float, figures: Budget
-) -> list[Measurement]:
-    pixel_area = row_pitch * profile_pitch
-    if raised.count == 0:
-        return [
-            Measurement("V+", "Raised volume (burr)", 0.0, "mm3", 0.0, "No raised area was found."),
-        ]
-    owner = owners(raised, row_pitch, profile_pitch)
-    inside = (owner > 0) & valid
-    volume = float(residual[inside].sum(dtype=np.float64)) * pixel_area * 1e-9
-    u_volume = figures.volume_mm3(volume, int(np.count_nonzero(inside)), pixel_area)
-    height = float(np.nanmax(np.where((raised.labels > 0) & valid, raised.depth_image.value, np.nan)))
-    profiles = (raised.labels > 0).any(axis=0)
-    return [
-        Measurement(
-            "V+",
-            "Raised volume (burr)",
-            volume,
-            "mm3",
-            u_volume,
-            f"Signed sum over the widened mask of {raised.count} raised areas; {figures.sentence}.",
-        ),
-        Measurement(
-            "h_b",
-            "Burr height",
-            height,
-            "um",
-            figures.depth_um(height, raised.sigma_depth_um),
-            f"Highest point of the smoothed residual in raised areas; {figures.sentence}.",
-        ),
-        Measurement(
-            "L_b",
-            "Burr length along the edge",
-            float(np.count_nonzero(profiles)) * profile_pitch / 1e3,
-            "mm",
-            profile_pitch / 1e3,
-            "Union of the raised areas' extents along the edge.",
-        ),
-    ]
-
-
-def _edge_numbers(edge: Edge | None, from_baseline: bool, profile_pitch: float, figures: Budget) -> list[Measurement]:
-    if edge is None:
-        return []
-    recession = edge.recession_um[np.isfinite(edge.recession_um)]
-    if recession.size == 0:
-        return []
-    origin = (
-        "against the edge line of the baseline scan"
-        if from_baseline
-        else "against the line through this scan's own undamaged edge, so uniform wear does not show"
-    )
-    pitch = figures.pitch or 0.0
-    # Neighbouring edge points share speckle: about one independent point per 50 um.
-    independent = max(1.0, recession.size * min(1.0, profile_pitch / 50.0))
-    u_point = math.hypot(edge.sigma_um, 0.0)
-
-    def u(value: float, points: float) -> float:
-        return math.hypot(u_point / math.sqrt(points), value * pitch)
-
-    mean, largest = float(recession.mean()), float(recession.max())
-    p95, rms = float(np.percentile(recession, 95.0)), float(np.sqrt(np.mean(recession**2)))
-    numbers = [
-        Measurement(
-            "ER_mean", "Edge recession, mean", mean, "um", u(mean, independent), f"Mean over the edge {origin}."
-        ),
-        Measurement(
-            "ER_max", "Edge recession, largest", largest, "um", u(largest, 1.0), f"Largest 50 um median {origin}."
-        ),
-        Measurement("ER_p95", "Edge recession, 95th percentile", p95, "um", u(p95, 1.0), f"95th percentile {origin}."),
-        Measurement("ER_rms", "Edge recession, rms", rms, "um", u(rms, independent), f"Root mean square {origin}."),
-        Measurement(
-            "EL",
-            "Edge line straightness",
-            edge.straightness_um,
-            "um",
-            u(edge.straightness_um, 1.0) * math.sqrt(2.0),
-            "Span of the edge about its own robust line.",
-        ),
-    ]
-    if math.isfinite(edge.rounded_um):
-        numbers.append(
-            Measurement(
-                "l_r",
-                "Rounded length at the edge",
-                edge.rounded_um,
-                "um",
-                u(edge.rounded_um, independent),
-                "Distance from the edge line to where the median surface stays within 3 standard deviations of the "
-                "reference for 50 um; a substitute for an edge radius, which needs both faces.",
-            )
-        )
-    return numbers
-
-
-def _roughness_numbers(
-    roughness: Roughness | None, noise: Noise, instrument_noise: float | None, figures: Budget
-) -> list[Measurement]:
-    if roughness is None:
-        return []
-    filters = f"S-filter {roughness.s_filter_um:g} um, L-filter {roughness.l_filter_um:g} um, damage and edge left out"
-    # Independent points of the filtered surface: at least one per kappa pixels.
-    independent = max(1.0, roughness.points / noise.kappa)
-    scale = figures.scale or 0.0
-
-    def u(value: float) -> float:
-        return math.hypot(value / math.sqrt(2.0 * independent), value * scale)
-
-    numbers = [
-        Measurement(
-            name,
-            title,
-            float(getattr(roughness, name)),
-            "um",
-            u(float(getattr(roughness, name))),
-            f"ISO 25178-2; {filters}; instrument noise included.",
-        )
-        for name, title in (
-            ("Sa", "Arithmetic mean height"),
-            ("Sq", "Root mean square height"),
-        )
-    ]
-    # Extremes carry the noise of single points of the filtered surface.
-    numbers += [
-        Measurement(
-            name,
-            title,
-            float(getattr(roughness, name)),
-            "um",
-            math.hypot(roughness.Sq, float(getattr(roughness, name)) * scale),
-            f"ISO 25178-2; {filters}; extremes of all points, noise peaks included.",
-        )
-        for name, title in (("Sz", "Maximum height"), ("Sp", "Maximum peak height"), ("Sv", "Maximum pit depth"))
-    ]
-    numbers += [
-        Measurement("Ssk", "Skewness", roughness.Ssk, "1", math.sqrt(6.0 / independent), f"ISO 25178-2; {filters}."),
-        Measurement(
-            "Sku",
-            "Kurtosis",
-            roughness.Sku,
-            "1",
-            math.sqrt(24.0 / independent),
-            f"ISO 25178-2, 3 for a Gaussian; {filters}.",
-        ),
-        Measurement(
-            "Sdq",
-            "Root mean square gradient",
-            roughness.Sdq,
-            "1",
-            u(roughness.Sdq),
-            f"ISO 25178-2, triangulated; {filters}.",
-        ),
-        Measurement(
-            "Sdr",
-            "Developed area ratio",
-            roughness.Sdr,
-            "%",
-            2.0 * u(roughness.Sdr),
-            f"ISO 25178-2, triangulated; {filters}.",
-        ),
-    ]
-    title = "Root mean square height, noise corrected"
-    if instrument_noise is None:
-        text = (
-            "Not resolvable: without the instrument's noise from a displaced repeat scan, Sq cannot be told from noise."
-        )
-        numbers.append(Measurement("Sq_c", title, None, "um", None, text))
-    elif roughness.Sq < RESOLVABLE * instrument_noise:
-        text = (
-            f"Not resolvable: Sq {roughness.Sq:.2f} um is below {RESOLVABLE:g} times the instrument's noise of "
-            f"{instrument_noise:.2f} um."
-        )
-        numbers.append(Measurement("Sq_c", title, None, "um", None, text))
-    else:
-        corrected = math.sqrt(roughness.Sq**2 - instrument_noise**2)
-        text = f"Square root of Sq^2 - {instrument_noise:.2f}^2 (instrument noise from a displaced repeat); {filters}."
-        numbers.append(Measurement("Sq_c", title, corrected, "um", u(roughness.Sq) * roughness.Sq / corrected, text))
-    return numbers
-
-
-def _quality_numbers(
-    image: RangeImage,
-    valid: Mask,
-    expected: Mask,
-    plane: Plane,
-    noise: Noise,
-    row_pitch: float,
-    profile_pitch: float,
-) -> list[Measurement]:
-    on_bevel = int(np.count_nonzero(expected))
-    undefined = 100.0 * float(np.count_nonzero(expected & ~valid)) / max(on_bevel, 1)
-    inliers = 100.0 * plane.inlier_fraction
-    independent = max(1.0, np.count_nonzero(valid) / noise.kappa)
-    return [
-        Measurement(
-            "q_undef",
-            "Undefined pixels",
-            100.0 * image.undefined_share,
-            "%",
-            None,
-            f"{image.undefined} of {image.height_um.size} pixels of the whole range image.",
-        ),
-        Measurement(
-            "q_undef_bevel",
-            "Undefined pixels on the bevel",
-            undefined,
-            "%",
-            None,
-            "Not measured or set aside as wild, on the tool's side of the edge line.",
-        ),
-        Measurement(
-            "sigma",
-            "Noise about the reference",
-            noise.sigma_um,
-            "um",
-            noise.sigma_um / math.sqrt(2.0 * independent),
-            f"1.4826 MAD of single pixels off damage, cell {profile_pitch:.4g} x {row_pitch:.4g} um; kappa "
-            f"{noise.kappa:.2f}.",
-        ),
-        Measurement(
-            "q_plane",
-            "Surface agreeing with the plane",
-            inliers,
-            "%",
-            None,
-            f"Share of measured pixels within 3 noise standard deviations or 20 um of the reference; start {plane.start}.",
-        ),
-    ]
-
-
-def _plain(value: Any) -> Any:
-    """JSON values only: arrays to lists, numpy scalars to Python, NaN and infinities to null."""
-    if isinstance(value, dict):
-        return {str(key): _plain(one) for key, one in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(one) for one in value]
-    if isinstance(value, np.ndarray):
-        return [_plain(one) for one in value.tolist()]
-    if isinstance(value, np.generic):
-        return _plain(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -85,7 +85,7 @@ def _axes(shape: tuple[int, int], row_pitch_um: float, profile_pitch_um: float) 
     """Positions in mm from the centre of the image, so that the normal equations stay well conditioned."""
     y = (np.arange(shape[0]) - (shape[0] - 1) / 2) * row_pitch_um / 1e3
     x = (np.arange(shape[1]) - (shape[1] - 1) / 2) * profile_pitch_um / 1e3
-    return y, x
+    return np.asarray(y, dtype=np.float64), np.asarray(x, dtype=np.float64)
 
 
 def _design(y: Float64, x: Float64, form: Form) -> Float64:
@@ -93,6 +93,10 @@ def _design(y: Float64, x: Float64, form: Form) -> Float64:
     if form == "quadratic":
         columns += [y * y, y * x, x * x]
     return np.stack(columns, axis=1)
+
+
+def _solve(design: Float64, z: Float64) -> Float64:
+    return np.asarray(np.linalg.lstsq(design, z, rcond=None)[0], dtype=np.float64)
 
 
 def least_squares_plane(
@@ -105,7 +109,7 @@ def least_squares_plane(
     rows, profiles = np.nonzero(np.isfinite(height_um))
     y, x = _axes(height_um.shape[:2], row_pitch_um, profile_pitch_um)
     design = _design(y[rows], x[profiles], form)
-    return np.linalg.lstsq(design, height_um[rows, profiles].astype(np.float64), rcond=None)[0]
+    return _solve(design, height_um[rows, profiles].astype(np.float64))
 
 
 def fit_plane(
@@ -141,7 +145,7 @@ def fit_plane(
         noise = 1e-9
     block_design, block_z = _block_medians(height_um, valid, y, x, form)
 
-    first = np.linalg.lstsq(block_design, block_z, rcond=None)[0]
+    first = _solve(block_design, block_z)
     fits: list[tuple[float, Float64, float, Literal["least squares", "ransac"]]] = []
     tolerance = max(3.0 * noise, 1e-6)
     coefficients, sigma = _reweighted(design, z, first)
@@ -203,7 +207,7 @@ def _reweighted(design: Float64, z: Float64, coefficients: Float64) -> tuple[Flo
             break
         weight = np.clip(1.0 - (residual / (TUKEY_C * sigma)) ** 2, 0.0, None) ** 2
         normal = design.T @ (design * weight[:, None])
-        updated = np.linalg.lstsq(normal, design.T @ (weight * z), rcond=None)[0]
+        updated = _solve(normal, design.T @ (weight * z))
         if np.max(np.abs(updated - coefficients)) < 1e-9 * max(1.0, sigma):
             coefficients = updated
             break
@@ -218,18 +222,18 @@ def _ransac(design: Float64, z: Float64, tolerance: float) -> Float64:
     """
     rng = np.random.default_rng(20170925)
     parameters = design.shape[1]
-    best, best_count = np.linalg.lstsq(design, z, rcond=None)[0], -1
+    best, best_count = _solve(design, z), -1
     for _ in range(RANSAC_DRAWS):
         chosen = rng.choice(z.size, size=parameters, replace=False)
         if np.linalg.matrix_rank(design[chosen]) < parameters:
             continue
-        candidate = np.linalg.solve(design[chosen], z[chosen])
+        candidate = _solve(design[chosen], z[chosen])
         count = int(np.count_nonzero(np.abs(z - design @ candidate) <= tolerance))
         if count > best_count:
             best, best_count = candidate, count
     agreeing = np.abs(z - design @ best) <= tolerance
     if np.count_nonzero(agreeing) >= parameters:
-        best = np.linalg.lstsq(design[agreeing], z[agreeing], rcond=None)[0]
+        best = _solve(design[agreeing], z[agreeing])
     return best
 
 

@@ -153,7 +153,9 @@ class Chip:
         return math.pi / 3.0 * (self.length_um / 2.0) * self.reach_um * self.depth_um * 1e-9
 
     def depth_at(self, from_edge_um: NDArray[np.float64], profile_um: NDArray[np.float64]) -> NDArray[np.float64]:
-        inside = 1.0 - (from_edge_um / self.reach_um) ** 2 - ((profile_um - self.profile_um) / (self.length_um / 2)) ** 2
+        inside = (
+            1.0 - (from_edge_um / self.reach_um) ** 2 - ((profile_um - self.profile_um) / (self.length_um / 2)) ** 2
+        )
         return self.depth_um * np.sqrt(np.clip(inside, 0.0, None))
 
 
@@ -177,9 +179,7 @@ def knife(
     sliding: int = 5,
 ) -> RangeImage:
     """A bevel that ends at a sharp edge; beyond it no light but ``stray`` wrong heights. Chips bite into the edge."""
-    plate = surface(
-        shape, pitches_um, pits=pits, sigma_um=sigma_um, seed=seed, profiles=profiles, sliding=sliding
-    )
+    plate = surface(shape, pitches_um, pits=pits, sigma_um=sigma_um, seed=seed, profiles=profiles, sliding=sliding)
     rng = np.random.default_rng(seed + 1)
     height = plate.height_um.astype(np.float64)
     row = np.arange(shape[0])[:, None]
