@@ -22,7 +22,7 @@ WATCH, REPLACE = "#b07d00", "#c1121f"
 MOST_EVENTS = 8
 
 
-def draw_trend(trends: Sequence[dict[str, Any]], width: float = 84.0, height: float = 50.0) -> str | None:
+def draw_trend(trends: Sequence[dict[str, Any]], width: float = 84.0, height: float = 52.0) -> str | None:
     """Return the SVG of one metric's trends (`selectors.trend`), one per region; None if nothing was ever measured."""
     points = [(moment(p["t"]), p["value"]) for trend in trends for p in trend["points"] if p["value"] is not None]
     if not points:
@@ -41,7 +41,7 @@ def draw_trend(trends: Sequence[dict[str, Any]], width: float = 84.0, height: fl
     headroom = 0.08 * ((top_value - bottom_value) or 1.0)
     high, low = top_value + headroom, bottom_value - (headroom if bottom_value < 0 else 0)
 
-    left, top, right, bottom = 11.5, 5.0, 2.0, 6.5
+    left, top, right, bottom = 11.5, 8.0, 2.0, 5.0
     w, h = width - left - right, height - top - bottom
     paper = Drawing(width, height)
 
@@ -78,11 +78,11 @@ def draw_trend(trends: Sequence[dict[str, Any]], width: float = 84.0, height: fl
     paper.line(left, top, left, top + h, FAINT)
     paper.line(left, top + h, left + w, top + h, FAINT)
     paper.text(2.4, top + h / 2, unit_sign(trends[0]["metric"]["unit"]), 2.4, "middle", INK, -90)
-    at = left + 1.5
+    at = left + 1.0
     for (colour, shape), trend in zip(SERIES, trends, strict=False):
-        paper.mark(at, top + 2.0, shape, colour)
-        paper.text(at + 1.6, top + 2.8, trend["region"]["name"], 2.4, halo=True)
-        at += 4.5 + 1.3 * len(trend["region"]["name"])
+        paper.mark(at, 1.9, shape, colour)
+        paper.text(at + 1.6, 2.7, trend["region"]["name"], 2.5)
+        at += 5.0 + 1.4 * len(trend["region"]["name"])
     return paper.svg()
 
 

@@ -47,6 +47,7 @@ def inspection_content(inspection: Inspection) -> tuple[Json, dt.datetime]:
     as_of = max([*moments, inspection.requested_at])
     verdict = verdict_of_visit([result.verdict if (result := results[scan.pk]) else None for scan in scans])
     limit_sets = _once(result.limit_set for result in found)
+    labels = {row.metric: row.label for result in found for row in result.measurements.all()}
     content = {
         "plant": getattr(settings, "PLANT_NAME", ""),
         "inspection": str(inspection.pk),
@@ -67,7 +68,7 @@ def inspection_content(inspection: Inspection) -> tuple[Json, dt.datetime]:
         "note": tool.note.strip(),
         "regions": [_region(scan, results[scan.pk]) for scan in scans],
         "charts": _charts(inspection, limit_sets, as_of),
-        "limits": [_limits(limit_set) for limit_set in limit_sets],
+        "limits": [_limits(limit_set, labels) for limit_set in limit_sets],
         "calibrations": [_calibration(calibration, as_of) for calibration in _once(r.calibration for r in found)],
         "uncalibrated": any(result.calibration is None for result in found),
         "recipes": [_recipe(recipe) for recipe in _once(result.recipe for result in found)],
@@ -131,7 +132,7 @@ def _region(scan: Scan, result: RangeImage | None) -> Json:
         [
             str(damage.number),
             damage.severity,
-            f"{plain(damage.start_mm, 4)} to {plain(damage.end_mm, 4)}",
+            f"{damage.start_mm:.2f} to {damage.end_mm:.2f}",
             plain(damage.length_mm, 3),
             with_uncertainty(damage.depth_um, damage.u_depth_um),
             with_uncertainty(damage.volume_mm3, damage.u_volume_mm3),
@@ -164,7 +165,12 @@ def _precision(result: RangeImage) -> list[list[str]]:
         ["Saturated", f"{100 * precision.saturated_share:.4f} % ({precision.saturated_count})"],
         ["Noise σ, flat part", sigma],
         ["Range image", f"{result.rows} × {result.profiles}, {result.row_pitch_um:.3f} × {result.profile_pitch_um:.2f} µm"],
-        ["Processing", f"{precision.ns_per_range_pixel:.0f} ns per range pixel"],
+        [
+            "Processing",
+            "not timed"
+            if precision.ns_per_range_pixel is None
+            else f"{precision.ns_per_range_pixel:.0f} ns per range pixel",
+        ],
     ]
 
 
@@ -189,17 +195,19 @@ def _charts(inspection: Inspection, limit_sets: Sequence[LimitSet], as_of: dt.da
     return charts
 
 
-def _limits(limit_set: LimitSet) -> Json:
+def _limits(limit_set: LimitSet, labels: dict[str, str]) -> Json:
     return {
         "title": f"{limit_set.tool_type}, version {limit_set.version}, in force since {_day(limit_set.created_at)}",
         "reason": limit_set.reason,
-        "rows": [_limit(limit) for limit in limit_set.limits.all()],
+        "rows": [_limit(limit, labels) for limit in limit_set.limits.all()],
     }
 
 
-def _limit(limit: Limit) -> list[str]:
+def _limit(limit: Limit, labels: dict[str, str]) -> list[str]:
     bounds = [plain(bound) if bound is not None else "none" for bound in (limit.watch_above, limit.replace_above)]
-    return [limit.metric, *bounds, unit_sign(limit.unit)]
+    label = labels.get(limit.metric)
+    name = f"{label} ({limit.metric})" if label and label != limit.metric else limit.metric
+    return [name, *bounds, unit_sign(limit.unit)]
 
 
 def _calibration(calibration: Calibration, as_of: dt.datetime) -> list[list[str]]:

@@ -22,7 +22,7 @@ from scanning.range_image import RangeImage
 from scanning.surface.plane import fit_plane
 
 #: Room on the paper, mm.
-WIDE, TALL = 92.0, 62.0
+WIDE, TALL = 84.0, 54.0
 LEAST_SIDE = 16.0
 DOTS_PER_MM = 8
 LEAST_SPAN_UM = 50.0

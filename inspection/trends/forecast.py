@@ -118,32 +118,37 @@ def forecast_sentence(
     forecast = wear.time_to_limit(limit)
     if forecast.at is None:
         return f"{label} shows no rising trend over {wear.n} scans, so it does not approach {target}.", forecast
-    when = _place(fit, forecast.at, life_unit)
+    unit_of_life = "days" if fit.axis == "date" else life_unit
     left = ""
     if now is not None:
         rest = max(0.0, forecast.at - now)
-        left = f", {number(rest)} {'days' if fit.axis == 'date' else life_unit} from now" if rest else ", which is now"
+        left = f", {number(rest)} {unit_of_life} from now" if rest else ", which is now"
+    at = _place(fit, forecast.at)
+    early = _place(fit, forecast.earliest) if forecast.earliest is not None else None
     if wear.low_confidence:
         interval = f"low confidence: only {wear.n} scans, no interval"
-    elif forecast.latest is not None and forecast.earliest is not None:
-        early = _place(fit, forecast.earliest, life_unit, with_date=False)
-        late = _place(fit, forecast.latest, life_unit, with_date=False)
-        interval = f"95 %: {early} to {late}"
-    elif forecast.earliest is not None:
-        early = _place(fit, forecast.earliest, life_unit, with_date=False)
+    elif forecast.latest is not None and early is not None:
+        interval = f"95 %: {early} to {_place(fit, forecast.latest)}"
+    elif early is not None:
         interval = f"95 %: not before {early}, no upper bound"
     else:
         interval = "the trend is not yet clear of the scatter, no upper bound"
-    return f"{label} reaches {target} at about {when} ({interval}){left}.", forecast
+    unit_text = "" if fit.axis == "date" else f" {life_unit}"
+    date = fit.date_of(forecast.at) if fit.axis == "life" else None
+    present_use = f"; at the present use about {_day(date)}" if date else ""
+    return f"{label} reaches {target} at about {at}{unit_text} ({interval}){left}{present_use}.", forecast
 
 
-def _place(fit: SegmentFit, position: float, life_unit: str, *, with_date: bool = True) -> str:
+def _place(fit: SegmentFit, position: float) -> str:
+    """A place on the fit's axis: the number on the life axis, the day on the date axis."""
+    if fit.axis == "life":
+        return number(position)
     date = fit.date_of(position)
-    day = f"{date.day} {date:%B %Y}" if date else ""
-    if fit.axis == "date":
-        return day or f"day {number(position)}"
-    text = f"{number(position)} {life_unit}"
-    return f"{text} (at the present use, {day})" if day and with_date else text
+    return _day(date) if date else f"day {number(position)}"
+
+
+def _day(date: dt.datetime) -> str:
+    return f"{date.day} {date:%B %Y}"
 
 
 def number(value: float) -> str:

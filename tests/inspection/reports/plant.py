@@ -213,7 +213,7 @@ def result(
         origin="not resolvable: Sq is below 1.5 times the noise",
     )  # fmt: skip
     for number, (row, profile, radius, depth) in enumerate(chips, 1):
-        start = profile * 0.04165 - radius * 0.0085
+        start = 10 + 25 * i + profile * 0.04165 - radius * 0.0085
         Damage.objects.create(
             range_image=image, number=number,
             severity="large" if depth > 150 else "medium" if depth > 50 else "minor",

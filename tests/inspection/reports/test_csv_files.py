@@ -85,7 +85,7 @@ def test_the_measurements_come_one_row_per_scan_and_metric(viewer):
     assert row[heading.index("tool")] == "'=K-1"
     assert row[heading.index("value")] == "-12,25"
     assert row[heading.index("standard uncertainty")] == "3,1"
-    assert row[heading.index("unit")] == "µm"
+    assert row[heading.index("unit")] == "um"
     assert row[heading.index("origin")]
     tools = parsed(body(viewer.get("/reports/tools.csv")))
     assert tools[1][-1].startswith("'=cmd")
