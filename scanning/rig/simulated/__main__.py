@@ -1,7 +1,7 @@
 """Run a simulated rig: ``python -m scanning.rig.simulated --dir DIR [--speed-up X] [--scene R2 ...]``.
 
 Makes DIR/stage.tty and DIR/camera.sock, says so in one line, and runs until it is terminated or, with
-``--with-parent``, until the process that started it is gone. """
+``--with-parent``, until the process that started it is gone."""
 
 from __future__ import annotations
 

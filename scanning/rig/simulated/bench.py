@@ -203,7 +203,7 @@ class Bench:
 
         ``camera``: silent, incomplete, wrong_size, stuck, hang_up (``count`` frames). ``stage``: unplug, replug,
         reset, alarm (``code``), garbage (``text``), drop_to_host, drop_to_controller (``count`` bytes), mute, unmute,
-        dead_switch; unplug, reset and alarm also with ``in_move=True``: in the middle of the next move. """
+        dead_switch; unplug, reset and alarm also with ``in_move=True``: in the middle of the next move."""
         if part == "camera":
             if not hasattr(self.camera_faults, fault):
                 raise BadInput(f"The camera has no fault '{fault}'.")

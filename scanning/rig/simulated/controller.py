@@ -13,7 +13,7 @@ that died. Rigs therefore lead the serial adapter's DTR line, which the host's k
 the port ends in whatever way, through the laser's enable input and the controller's feed-hold pin (GRBL A1). That is
 what `link_lost` models: light out at once, feed hold, and a full reset when a host opens the port again, because the
 rising DTR pulses the reset pin of Arduino boards. On a board without that wire a killed host leaves the laser on until
-the port is opened again: fit the wire. """
+the port is opened again: fit the wire."""
 
 from __future__ import annotations
 
@@ -24,11 +24,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from scanning.rig.simulated.gcode import GcodeError, read_float, words
 from scanning.rig.simulated.motion import Block, Motion, Steps
 
 RX_BYTES = 128
 PLANNER_BLOCKS = 15
 LINE_CHARACTERS = 80
+#: How far beyond its limit switch the carriage runs against the end of the screw.
+END_STOP_MM = 0.5
+#: GRBL moves no slower than 1 mm/min.
+MINIMUM_FEED_MM_S = 1 / 60
 VERSION = "1.1h"
 BUILD = "20190830"
 #: Bootloader and start-up of an Arduino board after a hardware reset, in seconds; bytes sent meanwhile are lost.
@@ -49,10 +54,8 @@ Program = Generator[Until, None, None]
 Float3 = np.ndarray  # float32 (3,): the firmware's own precision, on purpose
 
 
-class _GcodeError(Exception):
-    def __init__(self, code: int) -> None:
-        super().__init__(code)
-        self.code = code
+class _Aborted(Exception):
+    """The line under way ended in a reset and gets no answer."""
 
 
 @dataclass
@@ -136,13 +139,23 @@ class Controller:
     def position_um(self, now: float) -> float:
         """Position of the carriage in micrometres from where homing leaves it."""
         pull_off = round(self.settings[27] * self.settings[100])
-        on_screw = self._zero_on_screw + self._motion.position(now)[0]
+        on_screw = self._on_screw(now)
         steps = on_screw - pull_off if self._homes_to_beginning else self._far_switch - pull_off - on_screw
         return steps * self.step_um
 
     @property
     def _homes_to_beginning(self) -> bool:
         return bool(int(self.settings[23]) & 1)
+
+    def _on_screw(self, now: float) -> int:
+        """Where the carriage is, in steps from the first switch; the ends of the screw stop it in any case."""
+        end_stop = round(END_STOP_MM * self.settings[100])
+        at = self._zero_on_screw + self._motion.position(now)[0]
+        return min(max(at, -end_stop), self._far_switch + end_stop)
+
+    def _stall(self) -> None:
+        """Steps made against an end of the screw are lost: the count runs away from the truth."""
+        self._zero_on_screw = self._on_screw(self.now) - self._motion.position(self.now)[0]
 
     @property
     def _far_switch(self) -> int:
@@ -349,7 +362,7 @@ class Controller:
         self._waiting = None
 
     def _lose_count(self) -> None:
-        self._motion.drop(self.now)
+        self._drop()
         self._zero_on_screw += self._motion.position(self.now)[0]
         self._motion.place((0, 0, 0))
 
@@ -368,11 +381,11 @@ class Controller:
         code = 6 if self.state == "Home" else 3
         self._outgoing_before_reset()
         if (under_way and not self._motion.idle) or self.state == "Home":
-            self._motion.drop(self.now)
+            self._drop()
             self._say(f"ALARM:{code}")
             self.state = "Alarm"
         else:
-            self._motion.drop(self.now)
+            self._drop()
         locked = self.state == "Alarm"
         self._start_fresh()
         self.state = "Alarm" if locked else "Idle"
@@ -395,7 +408,7 @@ class Controller:
 
     def _settle_hold(self) -> None:
         if self._jog_cancelled and self._motion.stopped_in_hold(self.now):
-            self._motion.drop(self.now)
+            self._drop()
             self._gc = self._mpos(self._motion.end)
             self._jog_cancelled = False
             self.state = "Idle"
@@ -409,7 +422,7 @@ class Controller:
     def _critical_alarm(self, code: int) -> None:
         """Hard or soft limit: everything off, and deaf to all but a reset."""
         self._modal.spindle = 5
-        self._motion.drop(self.now)
+        self._drop()
         self._gc = self._mpos(self._motion.end)
         self.state = "Alarm"
         self._critical = True
@@ -417,9 +430,16 @@ class Controller:
         self._say(f"ALARM:{code}")
         self._say("[MSG:Reset to continue]")
 
+    def _homing_failed(self, code: int) -> None:
+        """The firmware alarms, resets itself and greets; the $H gets no answer."""
+        self._alarm(code)
+        self._start_fresh()
+        self._greet()
+        raise _Aborted
+
     def _alarm(self, code: int) -> None:
         self._modal.spindle = 5
-        self._motion.drop(self.now)
+        self._drop()
         self._gc = self._mpos(self._motion.end)
         self.state = "Alarm"
         self._say(f"ALARM:{code}")
@@ -427,7 +447,7 @@ class Controller:
     # ---- limit switch -------------------------------------------------------------------------------------------
 
     def _pressed(self) -> bool:
-        on_screw = self._zero_on_screw + self._motion.position(self.now)[0]
+        on_screw = self._on_screw(self.now)
         return not self.faults.dead_switch and not 0 < on_screw < self._far_switch
 
     def _switch_time(self) -> float | None:
@@ -444,13 +464,19 @@ class Controller:
     def _switch_hit(self) -> None:
         if self.state == "Home":
             self._homing_hit = True
-            self._motion.drop(self.now)
+            self._drop()
         else:
             self._critical_alarm(1)
 
     # ---- motion bookkeeping -------------------------------------------------------------------------------------
 
+    def _drop(self) -> None:
+        """Step pulses cease: the carriage stays where it is, the queue is gone."""
+        self._stall()
+        self._motion.drop(self.now)
+
     def _block_ended(self) -> None:
+        self._stall()
         if self._motion.idle and self.state in ("Run", "Jog"):
             self.state = "Idle"
         self._settle_hold()
@@ -481,7 +507,7 @@ class Controller:
         unit = (delta[0] / length, delta[1] / length, delta[2] / length)
         top = min(self.settings[110 + a] / 60 / abs(unit[a]) for a in range(3) if unit[a])
         accel = min(self.settings[120 + a] / abs(unit[a]) for a in range(3) if unit[a])
-        return Block(start, end, length, unit, min(mm_s, top), accel, laser_scale)
+        return Block(start, end, length, unit, min(max(mm_s, MINIMUM_FEED_MM_S), top), accel, laser_scale)
 
     # ---- the firmware's main loop -------------------------------------------------------------------------------
 
@@ -494,7 +520,7 @@ class Controller:
             if self._waiting is not None and not self._waiting():
                 return
             program = self._program
-            waiting = next(program)
+            waiting = next(program, None)
             if program is self._program:  # an alarm inside the step starts a fresh program
                 self._waiting = waiting
 
@@ -512,14 +538,16 @@ class Controller:
             self._line, self._line_overflow = "", False
             try:
                 if overflow:
-                    raise _GcodeError(11)
+                    raise GcodeError(11)
                 if line.startswith("$"):
                     yield from self._system(line)
                 elif line:
                     if self.state in ("Alarm", "Jog"):
-                        raise _GcodeError(9)
+                        raise GcodeError(9)
                     yield from self._gcode(line)
-            except _GcodeError as error:
+            except _Aborted:
+                return  # a fresh program has taken over
+            except GcodeError as error:
                 self._say(f"error:{error.code}")
             else:
                 if not self._critical:
@@ -534,7 +562,7 @@ class Controller:
         rest = line[1:]
         if rest.startswith("J="):
             if self.state not in ("Idle", "Jog"):
-                raise _GcodeError(8)
+                raise GcodeError(8)
             yield from self._gcode(rest[2:], jog=True)
             return
         if rest == "":
@@ -548,7 +576,7 @@ class Controller:
         elif rest == "C":
             self._check_mode()
         elif self.state not in ("Idle", "Alarm"):
-            raise _GcodeError(8)
+            raise GcodeError(8)
         elif rest == "$":
             for number in sorted(self.settings):
                 value = self.settings[number]
@@ -563,25 +591,25 @@ class Controller:
             self._say("$N1=")
         elif rest == "H":
             if not self.settings[22]:
-                raise _GcodeError(5)
+                raise GcodeError(5)
             yield from self._home()
         elif match := re.fullmatch(r"(\d+)=([-+]?\d*\.?\d*)", rest):
             self._store(int(match[1]), match[2])
         else:
-            raise _GcodeError(3)
+            raise GcodeError(3)
 
     def _store(self, number: int, text: str) -> None:
         if not any(c.isdigit() for c in text):
-            raise _GcodeError(2)
-        value = _read_float(text)
+            raise GcodeError(2)
+        value = read_float(text)
         if number not in self.settings:
-            raise _GcodeError(3)
-        if value < 0:
-            raise _GcodeError(4)
+            raise GcodeError(3)
+        if value < 0 or (value == 0 and number >= 100):  # the firmware would divide by this zero
+            raise GcodeError(4)
         if number == 0 and value < 3:
-            raise _GcodeError(6)
+            raise GcodeError(6)
         if number == 20 and value and not self.settings[22]:
-            raise _GcodeError(10)
+            raise GcodeError(10)
         self.settings[number] = int(value) if number in _INTEGER_SETTINGS else value
         if number == 22 and not value:
             self.settings[20] = 0
@@ -592,7 +620,7 @@ class Controller:
             self._say("[MSG:Disabled]")
             self._soft_reset()
         elif self.state != "Idle":
-            raise _GcodeError(8)
+            raise GcodeError(8)
         else:
             self._check = True
             self._say("[MSG:Enabled]")
@@ -600,6 +628,7 @@ class Controller:
     def _home(self) -> Program:
         """Seek the switch fast, back off, find it again slowly, back off; then the count is defined."""
         self.state = "Home"
+        backed_off = False
         steps_per_mm, pull_off = self.settings[100], self.settings[27]
         for reach_mm, speed, away in (
             (1.5 * self.settings[130], self.settings[25], False),
@@ -609,18 +638,20 @@ class Controller:
         ):
             self._homing_hit = False
             if not away and self._pressed():
-                self._alarm(8)  # the switch did not open when the carriage backed off
-                return
+                if backed_off:  # and yet the switch has not opened
+                    self._homing_failed(8)
+                continue  # standing on the switch counts as having found it
+            backed_off = away
             x, y, z = self._motion.end
             toward = -1 if self._homes_to_beginning else 1
             target = x + round(reach_mm * steps_per_mm) * (-toward if away else toward)
             block = self._block((target, y, z), speed / 60)
-            assert block is not None
+            if block is None:  # a pull-off of nothing
+                continue
             self._motion.add(block, self.now)
             yield lambda: self._motion.idle
             if not away and not self._homing_hit:
-                self._alarm(9)
-                return
+                self._homing_failed(9)
             self._dwell_until = self.now + self.settings[26] / 1000
             yield lambda: self._dwell_until is None
         _, y, z = self._motion.position(self.now)
@@ -635,7 +666,7 @@ class Controller:
     # ---- G-code -------------------------------------------------------------------------------------------------
 
     def _gcode(self, line: str, *, jog: bool = False) -> Program:
-        words = _words(line)
+        found = words(line)
         modal = _Modal(**vars(self._modal))
         axes: dict[int, float] = {}
         values: dict[str, float] = {}
@@ -647,10 +678,10 @@ class Controller:
 
         def group(name: str) -> None:
             if name in seen:
-                raise _GcodeError(21)
+                raise GcodeError(21)
             seen.add(name)
 
-        for letter, value in words:
+        for letter, value in found:
             if letter == "G":
                 code = round(value * 10)
                 if code in (0, 10):
@@ -674,60 +705,60 @@ class Controller:
                 elif code in (170, 400, 490, 540, 610, 940, 911):
                     group(f"g{code}")
                 else:
-                    raise _GcodeError(20)
+                    raise GcodeError(20)
             elif letter == "M":
                 code = round(value)
                 if value != code:
-                    raise _GcodeError(23)
+                    raise GcodeError(23)
                 if code in (3, 4, 5):
                     group("spindle")
                     modal.spindle, spindle_word = code, True
                 elif code in (0, 1, 2, 7, 8, 9, 30):
                     group("program")
                 else:
-                    raise _GcodeError(20)
+                    raise GcodeError(20)
             elif letter in "XYZ":
                 if "XYZ".index(letter) in axes:
-                    raise _GcodeError(25)
+                    raise GcodeError(25)
                 axes["XYZ".index(letter)] = value
             elif letter in "FSPLNT":
                 if letter in values:
-                    raise _GcodeError(25)
+                    raise GcodeError(25)
                 if value < 0:
-                    raise _GcodeError(4)
+                    raise GcodeError(4)
                 values[letter] = value
             else:
-                raise _GcodeError(20)
+                raise GcodeError(20)
         scale = np.float32(25.4) if modal.inches else np.float32(1.0)
 
         if jog:
             if seen - {"units", "distance", "nonmodal"} or spindle_word or nonmodal is not None or not axes:
-                raise _GcodeError(16)
+                raise GcodeError(16)
             if "F" not in values:
-                raise _GcodeError(22)
+                raise GcodeError(22)
             target = self._target(axes, modal.absolute, machine, scale)
             if self.settings[20] and self._outside(target):
-                raise _GcodeError(15)
+                raise GcodeError(15)
             yield from self._move(target, values["F"] * float(scale) / 60, 1.0, jog=True)
             return
 
         moves = bool(axes) and nonmodal is None
         if motion_word and axes and nonmodal is not None:
-            raise _GcodeError(24)
+            raise GcodeError(24)
         if nonmodal in (100, 920) and not axes:
-            raise _GcodeError(26)
+            raise GcodeError(26)
         if nonmodal == 40 and "P" not in values:
-            raise _GcodeError(28)
+            raise GcodeError(28)
         if nonmodal == 100 and (values.get("L") not in (2, 20) or values.get("P") not in (0, 1)):
-            raise _GcodeError(20 if "L" in values else 28)
+            raise GcodeError(20 if "L" in values else 28)
         if axes and moves and modal.motion == 80:
-            raise _GcodeError(31)
+            raise GcodeError(31)
         if "P" in values and nonmodal not in (40, 100):
-            raise _GcodeError(36)
+            raise GcodeError(36)
         if "F" in values:
             modal.feed_mm_min = values["F"] * float(scale)
         if moves and modal.motion == 1 and modal.feed_mm_min <= 0:
-            raise _GcodeError(22)
+            raise GcodeError(22)
         if "S" in values:
             modal.spindle_speed = values["S"]
 
@@ -853,34 +884,3 @@ class Controller:
 
 def _triple(mm: Float3) -> str:
     return ",".join(f"{float(v):.3f}" for v in mm)
-
-
-def _words(line: str) -> list[tuple[str, float]]:
-    """Split ``G1X5.2F100`` into words; errors as gcode.c: 1 no letter, 2 no number."""
-    words: list[tuple[str, float]] = []
-    at = 0
-    while at < len(line):
-        if not line[at].isalpha():
-            raise _GcodeError(1)
-        match = re.match(r"[-+]?(\d+\.?\d*|\.\d+)", line[at + 1 :])
-        if match is None:
-            raise _GcodeError(2)
-        words.append((line[at], _read_float(match[0])))
-        at += 1 + match.end()
-    return words
-
-
-def _read_float(text: str) -> float:
-    """GRBL's own number reader (nuts_bolts.c): eight digits, scaled in float32; its last bit decides about drift."""
-    sign, digits = (-1.0, text[1:]) if text[0] == "-" else (1.0, text.lstrip("+"))
-    whole, _, part = digits.partition(".")
-    used = (whole + part)[:8]
-    exponent = len(whole) - len(used) if len(whole) > len(used) else -(len(used) - len(whole))
-    value = np.float32(int(used or "0"))
-    while exponent <= -2:
-        value, exponent = np.float32(float(value) * 0.01), exponent + 2
-    if exponent == -1:
-        value = np.float32(float(value) * 0.1)
-    elif exponent > 0:
-        value = np.float32(float(value) * 10.0**exponent)
-    return sign * float(value)

@@ -157,11 +157,18 @@ def test_homing_toward_the_positive_end_mirrors() -> None:
 def test_homing_without_a_working_switch_is_alarm_9_and_reset_during_it_alarm_6() -> None:
     grbl = Conversation()
     grbl.controller.faults.dead_switch = True
-    assert grbl.say("$H", wait=120.0)[0] == "ALARM:9"
+    assert grbl.say("$H", wait=120.0) == ["ALARM:9", "Grbl 1.1h ['$' for help]", "[MSG:'$H'|'$X' to unlock]"]
     grbl = Conversation()
     grbl.say("$H", wait=0.2)
     assert grbl.say(b"?") == []  # no reports while homing
     assert grbl.say(b"\x18")[0] == "ALARM:6"
+
+
+def test_homing_from_the_switch_itself_works() -> None:
+    grbl = Conversation(start_um=-1000.0)
+    assert "|Pn:X" in grbl.say(b"?")[0]
+    assert grbl.say("$H", wait=60.0) == ["ok"]
+    assert grbl.controller.position_um(grbl.now) == 0.0
 
 
 def test_running_onto_a_limit_switch_is_alarm_1() -> None:

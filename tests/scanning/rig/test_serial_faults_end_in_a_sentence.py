@@ -136,6 +136,16 @@ def test_somebody_presses_hold_at_the_machine(lit: GrblStage, bench: Bench, monk
         scan_on(lit)
 
 
+def test_a_broken_home_switch_is_named_and_homing_works_once_it_is_mended(lit: GrblStage, bench: Bench) -> None:
+    bench.provoke("stage", "dead_switch")
+    with pytest.raises(StageFault, match=r"home switch was not found \(ALARM:9\); check the switch, its cable"):
+        lit.home()
+    assert laser_of(bench) == 0.0
+    bench.controller.faults.dead_switch = False
+    lit.home()
+    scan_on(lit)
+
+
 def test_unknown_status_fields_and_a_grblhal_banner_are_taken(
     make_bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
 ) -> None:

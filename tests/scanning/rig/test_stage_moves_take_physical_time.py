@@ -56,6 +56,7 @@ def test_a_hold_stops_within_its_braking_distance_and_resumes_to_the_exact_end()
     motion.hold(1.0)
     before = motion.position(1.0)[0]
     stop = motion.next_event()
+    assert stop is not None
     assert stop == pytest.approx(1.0 + 10 / 200)
     motion.finish_due(stop)
     assert motion.stopped_in_hold(stop)

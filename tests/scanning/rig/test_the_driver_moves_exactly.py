@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import select
+import socket
+import threading
 from collections.abc import Callable
 
 import pytest
@@ -14,7 +18,7 @@ STEP_UM = 0.49
 
 
 def truth_steps(bench: Bench) -> int:
-    return round(bench.state()["position_um"] / STEP_UM)
+    return round(float(bench.state()["position_um"]) / STEP_UM)
 
 
 def test_after_homing_the_host_counts_from_zero(stage: GrblStage, bench: Bench) -> None:
@@ -156,3 +160,35 @@ def test_it_can_be_opened_again_after_closing(make_bench: Callable[..., Bench]) 
         stage.close()
     with pytest.raises(StageFault):
         stage.move_to(1)
+
+
+def test_it_works_over_a_serial_server(bench: Bench) -> None:
+    """socket:// as of a serial-to-network adapter: a thread carries bytes between TCP and the bench's port."""
+    server = socket.create_server(("127.0.0.1", 0))
+
+    def carry() -> None:
+        host, _ = server.accept()
+        device = os.open(bench.port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        with host:
+            while True:
+                ready, _, _ = select.select([host.fileno(), device], [], [], 5.0)
+                if device in ready:
+                    host.sendall(os.read(device, 4096))
+                if host.fileno() in ready:
+                    data = host.recv(4096)
+                    if not data:
+                        break
+                    os.write(device, data)
+        os.close(device)
+
+    adapter = threading.Thread(target=carry)
+    adapter.start()
+    stage = GrblStage(f"socket://127.0.0.1:{server.getsockname()[1]}", travel_mm=100.0)
+    stage.open()
+    stage.home()
+    for step in range(1, 30):
+        stage.move_to(17 * step)
+    assert truth_steps(bench) == 17 * 29
+    stage.close()
+    adapter.join(5.0)
+    server.close()
