@@ -23,8 +23,8 @@ from scanning.range_image import RangeImage
 Float64 = NDArray[np.float64]
 
 # Shares of (rows, profiles) tried as flat sub-region, largest first; the paper's is 600 x 241 of 1000 x 241.
-_SHARES = ((0.6, 1.0), (1.0, 0.6), (0.6, 0.6), (0.3, 1.0), (0.6, 0.3), (0.3, 0.6), (0.3, 0.3), (0.15, 0.3), (0.3, 0.15))
-_SHARES_SMALL = ((0.15, 0.15), (0.1, 0.1))
+_SHARES = ((0.6, 1.0), (1.0, 0.6), (0.6, 0.6), (0.3, 1.0), (0.6, 0.3), (0.3, 0.6), (0.3, 0.3))
+_SHARES_SMALL = ((0.15, 0.3), (0.3, 0.15), (0.15, 0.15), (0.1, 0.1))
 _FLAT = 1.3
 _DEFINED = 0.8
 _WILD = 6.0
@@ -167,23 +167,29 @@ def find_flat(height_um: NDArray[np.float32]) -> FlatRegion | None:
     Small tiles (a twelfth of the image) give the noise, as the median of their own standard deviations. Windows are
     tried from large to small; among those of one size that are at least 80 % defined and scatter at most 1.3 x the
     noise, the best defined one is taken (not the quietest: that choice would flatter). When none is flat, the quietest
-    small window is returned as "none flat". Wild pixels are left out of the search, not out of the result. None when
-    hardly anything was measured.
+    small window is returned as "none flat". A window of at least 30 % x 30 % without wrong peaks is preferred; when
+    there is none, wild pixels are left out of the search, but never out of the result. None when hardly anything was
+    measured.
     """
     height = np.asarray(height_um, dtype=np.float64)
     rows, profiles = height.shape
     finite = np.isfinite(height)
     if np.count_nonzero(finite) < 4 or rows < 2 or profiles < 2:
         return None
-    sums = _Sums(height, finite & ~_wild(height, finite))
+    wild = _wild(height, finite)
+    sums = _Sums(height, finite & ~wild)
     tile = max(min(rows, 8), rows // 12), max(min(profiles, 8), profiles // 12)
     tiles = sums.windows(tile, tile, 0.5)
     usable = tiles.spread[np.isfinite(tiles.spread)]
     noise = float(np.median(usable)) if usable.size else math.inf
     quietest: tuple[float, FlatRegion] | None = None
-    for row_share, profile_share in (*_SHARES, *_SHARES_SMALL):
+    tries = [(sums, share) for share in (*_SHARES, *_SHARES_SMALL)]
+    if wild.any():
+        everything = _Sums(height, finite)
+        tries = [(everything, share) for share in _SHARES] + tries
+    for kind, (row_share, profile_share) in tries:
         window = max(2, round(rows * row_share)), max(2, round(profiles * profile_share))
-        tried = sums.windows(window, (max(1, rows // 20), max(1, profiles // 20)), _DEFINED)
+        tried = kind.windows(window, (max(1, rows // 20), max(1, profiles // 20)), _DEFINED)
         if not np.isfinite(tried.spread).any():
             continue
         flat = tried.spread <= _FLAT * noise

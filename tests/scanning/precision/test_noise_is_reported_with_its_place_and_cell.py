@@ -92,6 +92,16 @@ def test_wild_pixels_count_in_sigma_and_not_in_the_robust_one() -> None:
     assert report.wild == np.count_nonzero(wrong[report.flat_region.slices])
 
 
+def test_a_streak_of_wrong_peaks_is_passed_by_when_there_is_room_beside_it() -> None:
+    height = _tilted()
+    height[150:300, 20] -= 800.0
+    report = precision_of(_image(height))
+    assert report.wild == 0
+    assert report.sigma_um == pytest.approx(SIGMA_UM, rel=0.03)
+    assert report.flat_region is not None
+    assert report.flat_region.chosen == "found"
+
+
 def test_correlated_noise_is_seen_as_such() -> None:
     white = np.random.default_rng(2).normal(0, 1, (300, 200))
     report = precision_of(_image(white[:, :-4] + white[:, 1:-3] + white[:, 2:-2] + white[:, 3:-1] + white[:, 4:]))
