@@ -11,10 +11,10 @@ from django.shortcuts import render
 from ninja import NinjaAPI
 from ninja.openapi.docs import DocsBase
 
+from inspection.api import ordering, reading  # noqa: F401 - they add their addresses to the router
 from inspection.api.answers import PlainJson, answer_faults
 from inspection.api.callers import SessionKey, TokenKey
-from inspection.api.ordering import router as ordering
-from inspection.api.reading import router as reading
+from inspection.api.routes import router
 
 
 class OfflineDocs(DocsBase):
@@ -38,6 +38,5 @@ api = NinjaAPI(
     renderer=PlainJson(),
     docs=OfflineDocs(),
 )
-api.add_router("", reading)
-api.add_router("", ordering)
+api.add_router("", router)
 answer_faults(api)

@@ -5,21 +5,20 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 from django.http import Http404, HttpRequest
-from ninja import Path, Router
+from ninja import Path, Status
 
 from inspection.api import shapes
 from inspection.api.callers import caller
 from inspection.api.reading import FAULTS, scan_by_id, visit_by_id
+from inspection.api.routes import router
 from inspection.api.shapes import Id
 from inspection.models import Rig, Role, Scan, Tool
 from inspection.services.queue import cancel_scan, enqueue_inspection
 from inspection.services.recipes import recipe_named
 from scanning.errors import BadInput
 
-router = Router(tags=["ordering"])
 
-
-@router.post("/inspections", response={201: shapes.Inspection, 409: shapes.Conflict, 400: shapes.Fault, **FAULTS})
+@router.post("/inspections", tags=["ordering"], response={201: shapes.Inspection, 409: shapes.Conflict, 400: shapes.Fault, **FAULTS})
 def order_inspection(request: HttpRequest, order: shapes.Order) -> Any:
     """Queue one scan per region of a tool at a rig. All are queued, or none."""
     by = caller(request, Role.OPERATOR)
@@ -44,10 +43,10 @@ def order_inspection(request: HttpRequest, order: shapes.Order) -> Any:
         reason=order.reason,
         exposures_us=order.exposures_us,
     )
-    return 201, visit_by_id(visit.pk)
+    return Status(201, visit_by_id(visit.pk))
 
 
-@router.post("/scans/{scan_id}/cancel", response={200: shapes.Scan, 409: shapes.Conflict, **FAULTS})
+@router.post("/scans/{scan_id}/cancel", tags=["ordering"], response={200: shapes.Scan, 409: shapes.Conflict, **FAULTS})
 def cancel(request: HttpRequest, scan_id: Annotated[Id, Path()]) -> Any:
     """Take a queued scan out of the queue, or stop a running one at its next step (it stays running until then)."""
     by = caller(request, Role.OPERATOR)

@@ -8,10 +8,11 @@ from typing import Annotated, Any, TypeVar
 
 from django.db.models import Model, OuterRef, Prefetch, QuerySet, Subquery
 from django.http import FileResponse, Http404, HttpRequest, HttpResponse, HttpResponseBase
-from ninja import Path, Query, Router
+from ninja import Path, Query
 
 from inspection.api import shapes
 from inspection.api.callers import Caller, caller
+from inspection.api.routes import router
 from inspection.api.shapes import Id, Word
 from inspection.models import Inspection, RangeImage, Rig, Role, Scan, Tool
 from inspection.reports.csv import Dialect, write_range_image
@@ -25,7 +26,6 @@ from inspection.selectors.trend import tool_trends, trend_metrics
 from inspection.states import ScanState
 from scanning.errors import BadInput
 
-router = Router(tags=["reading"])
 Limit = Annotated[int, Query(ge=1, le=500, description="Records per page.")]
 Offset = Annotated[int, Query(ge=0, le=10**9, description="Records to skip.")]
 M = TypeVar("M", bound=Model)
@@ -33,7 +33,7 @@ Key = Annotated[Id, Path()]
 FAULTS = {401: shapes.Fault, 403: shapes.Fault, 404: shapes.Fault, 422: shapes.Fault}
 
 
-@router.get("/me", response={200: shapes.Me, 401: shapes.Fault})
+@router.get("/me", tags=["reading"], response={200: shapes.Me, 401: shapes.Fault})
 def me(request: HttpRequest) -> Any:
     """Who this key or session is, and what it may do."""
     user = caller(request)
@@ -47,7 +47,7 @@ def me(request: HttpRequest) -> Any:
     }
 
 
-@router.get("/tools", response={200: shapes.Tools, **FAULTS})
+@router.get("/tools", tags=["reading"], response={200: shapes.Tools, **FAULTS})
 def tools(request: HttpRequest, code: Word = "", status: Word = "", limit: Limit = 100, offset: Offset = 0) -> Any:
     """All tools by code, with the verdict of their newest results. ``code`` finds one exactly."""
     caller(request)
@@ -61,7 +61,7 @@ def tools(request: HttpRequest, code: Word = "", status: Word = "", limit: Limit
     return _paged(found, limit, offset, _tool_rows)
 
 
-@router.get("/tools/{tool_id}", response={200: shapes.ToolDetail, **FAULTS})
+@router.get("/tools/{tool_id}", tags=["reading"], response={200: shapes.ToolDetail, **FAULTS})
 def tool(request: HttpRequest, tool_id: Key) -> Any:
     """One tool with its regions and the metrics it was measured by."""
     caller(request)
@@ -75,14 +75,14 @@ def tool(request: HttpRequest, tool_id: Key) -> Any:
     }
 
 
-@router.get("/tools/{tool_id}/regions", response={200: list[shapes.Region], **FAULTS})
+@router.get("/tools/{tool_id}/regions", tags=["reading"], response={200: list[shapes.Region], **FAULTS})
 def regions(request: HttpRequest, tool_id: Key) -> Any:
     """The regions of a tool's edge."""
     caller(request)
     return list(_one(Tool.objects.prefetch_related("regions"), tool_id, "tool").regions.all())
 
 
-@router.get("/tools/{tool_id}/trend", response={200: list[dict[str, Any]], **FAULTS})
+@router.get("/tools/{tool_id}/trend", tags=["reading"], response={200: list[dict[str, Any]], **FAULTS})
 def trend(request: HttpRequest, tool_id: Key, metric: Word, region: Word = "") -> Any:
     """The history of one metric per active region: points, events, limits, wear line, forecast, and a sentence."""
     caller(request)
@@ -95,7 +95,7 @@ def trend(request: HttpRequest, tool_id: Key, metric: Word, region: Word = "") -
     return trends
 
 
-@router.get("/inspections", response={200: shapes.Inspections, **FAULTS})
+@router.get("/inspections", tags=["reading"], response={200: shapes.Inspections, **FAULTS})
 def inspections(request: HttpRequest, tool: Word = "", limit: Limit = 50, offset: Offset = 0) -> Any:
     """Visits, newest first; ``tool`` is a code."""
     caller(request)
@@ -105,14 +105,14 @@ def inspections(request: HttpRequest, tool: Word = "", limit: Limit = 50, offset
     return _paged(found, limit, offset, lambda rows: [inspection_row(row) for row in rows])
 
 
-@router.get("/inspections/{inspection_id}", response={200: shapes.Inspection, **FAULTS})
+@router.get("/inspections/{inspection_id}", tags=["reading"], response={200: shapes.Inspection, **FAULTS})
 def inspection(request: HttpRequest, inspection_id: Key) -> Any:
     """One visit with its scans."""
     caller(request)
     return inspection_row(_one(_visits(), inspection_id, "inspection"))
 
 
-@router.get("/inspections/{inspection_id}/report.pdf", response={**FAULTS})
+@router.get("/inspections/{inspection_id}/report.pdf", tags=["reading"], response={**FAULTS})
 def report(request: HttpRequest, inspection_id: Key) -> HttpResponseBase:
     """The PDF report of a visit."""
     caller(request)
@@ -122,7 +122,7 @@ def report(request: HttpRequest, inspection_id: Key) -> HttpResponseBase:
     return answer
 
 
-@router.get("/scans", response={200: shapes.Scans, **FAULTS})
+@router.get("/scans", tags=["reading"], response={200: shapes.Scans, **FAULTS})
 def scans(
     request: HttpRequest,
     tool: Word = "",
@@ -144,7 +144,7 @@ def scans(
     return _paged(_with_verdict(chosen.scans()), limit, offset, lambda rows: [scan_row(row) for row in rows])
 
 
-@router.get("/scans/{scan_id}", response={200: shapes.ScanDetail, **FAULTS})
+@router.get("/scans/{scan_id}", tags=["reading"], response={200: shapes.ScanDetail, **FAULTS})
 def scan(request: HttpRequest, scan_id: Key) -> Any:
     """One scan with its newest result: verdict, numbers with uncertainties, damages, precision and provenance."""
     caller(request)
@@ -163,7 +163,7 @@ def scan(request: HttpRequest, scan_id: Key) -> Any:
     }
 
 
-@router.get("/scans/{scan_id}/range.npz", response={**FAULTS})
+@router.get("/scans/{scan_id}/range.npz", tags=["reading"], response={**FAULTS})
 def range_npz(request: HttpRequest, scan_id: Key) -> HttpResponseBase:
     """The newest range image: numpy arrays column_px, height_um (NaN = not measured), intensity, width_px, pitches."""
     caller(request)
@@ -178,7 +178,7 @@ def range_npz(request: HttpRequest, scan_id: Key) -> HttpResponseBase:
     )
 
 
-@router.get("/scans/{scan_id}/range.csv", response={**FAULTS})
+@router.get("/scans/{scan_id}/range.csv", tags=["reading"], response={**FAULTS})
 def range_csv(request: HttpRequest, scan_id: Key, sep: Word = ",", decimal: Word = ".") -> HttpResponseBase:
     """The newest range image as a matrix of heights in um with mm on both axes; empty = not measured."""
     caller(request)
@@ -189,14 +189,14 @@ def range_csv(request: HttpRequest, scan_id: Key, sep: Word = ",", decimal: Word
     return streamed(write_range_image(load(stored), about, dialect), f"{scan_name(found)}_range")
 
 
-@router.get("/rigs", response={200: list[shapes.Rig], **FAULTS})
+@router.get("/rigs", tags=["reading"], response={200: list[shapes.Rig], **FAULTS})
 def rigs(request: HttpRequest) -> Any:
     """All rigs with the state of their queues."""
     caller(request)
     return list(Rig.objects.all())
 
 
-@router.get("/rigs/{slug}/queue", response={200: shapes.Queue, **FAULTS})
+@router.get("/rigs/{slug}/queue", tags=["reading"], response={200: shapes.Queue, **FAULTS})
 def queue(request: HttpRequest, slug: Annotated[Word, Path()]) -> Any:
     """What is on the rig, what waits and for what, what is being computed."""
     caller(request)
@@ -214,7 +214,7 @@ def queue(request: HttpRequest, slug: Annotated[Word, Path()]) -> Any:
     }
 
 
-@router.get("/due", response={200: list[shapes.Due], **FAULTS})
+@router.get("/due", tags=["reading"], response={200: list[shapes.Due], **FAULTS})
 def due(request: HttpRequest) -> Any:
     """What is due and when, most urgent first."""
     caller(request)

@@ -18,7 +18,7 @@ from inspection.states import ScanState
 from scanning.errors import BadInput
 from tests.inspection.reports import plant
 
-pytestmark = [pytest.mark.django_db, pytest.mark.urls("tests.inspection.reports.addresses")]
+pytestmark = pytest.mark.django_db
 
 
 @pytest.fixture

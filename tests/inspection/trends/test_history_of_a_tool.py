@@ -15,7 +15,7 @@ from inspection.selectors.trend import tool_trends, trend, trend_metrics
 from inspection.states import ScanState
 from tests.inspection.reports import plant
 
-pytestmark = [pytest.mark.django_db, pytest.mark.urls("tests.inspection.trends.addresses")]
+pytestmark = pytest.mark.django_db
 NOW = plant.FIRST_VISIT + dt.timedelta(days=80)
 
 
