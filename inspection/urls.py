@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from django.urls import URLPattern, URLResolver, include, path
 
+from inspection.api import api
+from inspection.health import health
 from inspection.views import calibrations, imports, overview, people, ranges, records, rigs, rules, scans, schedules, tools
 
 tool_urls = [
@@ -74,7 +76,10 @@ urlpatterns: list[URLPattern | URLResolver] = [
     path("schedules/<int:pk>/", schedules.schedule_edit, name="schedule-edit"),
     path("import/", imports.import_page, name="import"),
     path("", include(people_urls)),
+    path("reports/", include("inspection.reports.urls")),
+    path("api/v1/", api.urls),
     path("audit/", records.audit_page, name="audit"),
+    path("health/", health, name="health"),
     path("status/", records.health_page, name="health-page"),
     path("help/", records.help_page, name="help"),
 ]
