@@ -46,6 +46,10 @@ class CalibrationForm(forms.Form):
         return cleaned
 
 
+def _plain(value: float | None) -> str | None:
+    return None if value is None else f"{value:g}"
+
+
 class LimitsForm(forms.Form):
     """The whole new limit set of a tool type: one pair of fields per metric, and the reason."""
 
@@ -61,7 +65,15 @@ class LimitsForm(forms.Form):
                 self.fields[f"{kind}:{metric}"] = forms.FloatField(
                     required=False, label=f"{label}: {word}", widget=forms.NumberInput(attrs={"step": "any"})
                 )
-                self.initial[f"{kind}:{metric}"] = getattr(limit, f"{kind}_above") if limit else None
+                self.initial[f"{kind}:{metric}"] = _plain(getattr(limit, f"{kind}_above")) if limit else None
+
+    def limited(self) -> list[dict[str, Any]]:
+        """The metrics that have a limit now, or came back with one."""
+        return [row for row in self.rows() if any(bound.value() not in (None, "") or bound.errors for bound in row["pair"])]
+
+    def others(self) -> list[dict[str, Any]]:
+        limited = {row["metric"] for row in self.limited()}
+        return [row for row in self.rows() if row["metric"] not in limited]
 
     def rows(self) -> list[dict[str, Any]]:
         return [

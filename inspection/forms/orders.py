@@ -36,7 +36,7 @@ class ScanOrderForm(forms.Form):
         regions = tool.regions.filter(active=True)
         self.fields["regions"].queryset = regions  # type: ignore[attr-defined]
         self.fields["regions"].label_from_instance = lambda region: (  # type: ignore[attr-defined]
-            f"{region.name}: {region.start_mm:g} to {region.start_mm + region.length_mm:g} mm"
+            f"{region.name}: {region.start_mm:.2f} to {region.start_mm + region.length_mm:.2f} mm"
         )
         self.fields["recipe"].queryset = Recipe.objects.all()  # type: ignore[attr-defined]
         self.initial.setdefault("regions", [region.pk for region in regions])

@@ -14,6 +14,7 @@ class ToolTypeForm(forms.ModelForm):  # type: ignore[type-arg]  # not subscripta
     class Meta:
         model = ToolType
         fields = ("name", "edge_length_mm", "bevel_angle_deg", "life_unit", "note")
+        widgets = {"note": forms.Textarea(attrs={"rows": 3})}
         labels = {
             "edge_length_mm": "Edge length (mm)",
             "bevel_angle_deg": "Bevel angle (degrees)",
@@ -28,6 +29,7 @@ class ToolForm(forms.ModelForm):  # type: ignore[type-arg]  # not subscriptable 
     class Meta:
         model = Tool
         fields = ("code", "tool_type", "location", "status", "life_used", "note")
+        widgets = {"note": forms.Textarea(attrs={"rows": 3})}
         labels = {"life_used": "Use so far", "tool_type": "Tool type"}
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -36,6 +38,8 @@ class ToolForm(forms.ModelForm):  # type: ignore[type-arg]  # not subscriptable 
         if self.instance.pk:
             # What a tool is decides its limits; another type is another tool.
             del self.fields["tool_type"]
+        elif ToolType.objects.count() == 1:
+            self.initial["tool_type"] = self.initial.get("tool_type") or ToolType.objects.get()
 
     def clean_life_used(self) -> float:
         return self.cleaned_data["life_used"] or 0.0
@@ -49,18 +53,28 @@ class RegionForm(forms.ModelForm):  # type: ignore[type-arg]  # not subscriptabl
         model = Region
         fields = ("name", "start_mm", "length_mm", "row_offset", "rows", "flat_row", "flat_rows", "active")
         labels = {
-            "start_mm": "Starts at (mm along the stage)",
-            "length_mm": "Length (mm)",
+            "start_mm": "Starts at, along the stage",
+            "length_mm": "Length",
             "row_offset": "First sensor row",
             "rows": "Sensor rows",
             "flat_row": "Flat part: first row",
             "flat_rows": "Flat part: rows",
             "active": "Scan this region",
         }
+        widgets = {
+            "start_mm": forms.NumberInput(attrs={"step": "any"}),
+            "length_mm": forms.NumberInput(attrs={"step": "any"}),
+        }
         help_texts = {
             "rows": "Rows lie along the laser line, across the bevel.",
             "flat_rows": "Undamaged ground bevel: the precision report's sigma is taken there.",
         }
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        for name in ("start_mm", "length_mm"):
+            if isinstance(self.initial.get(name), float):
+                self.initial[name] = round(self.initial[name], 6)  # sums of step lengths end in 0000000003
 
     def _post_clean(self) -> None:
         """See ToolTypeForm."""

@@ -20,9 +20,14 @@ from inspection.states import LIVE, VERDICT_ORDER, ScanState, Verdict
 
 
 def newest_results(regions: QuerySet[Region]) -> QuerySet[Region]:
-    """Annotate each region with the id of the newest range image of its newest finished scan (``newest_id``)."""
+    """Annotate each region with the newest range image of its newest finished scan (``newest_id``), and with how its last
+    scan ended, well or badly (``last_state``)."""
     newest = RangeImage.objects.filter(scan__region=OuterRef("pk"), scan__state=ScanState.DONE)
-    return regions.annotate(newest_id=Subquery(newest.order_by("-scan__finished_at", "-created_at").values("pk")[:1]))
+    ended = Scan.objects.filter(region=OuterRef("pk"), finished_at__isnull=False).order_by("-finished_at", "-pk")
+    return regions.annotate(
+        newest_id=Subquery(newest.order_by("-scan__finished_at", "-created_at").values("pk")[:1]),
+        last_state=Subquery(ended.values("state")[:1]),
+    )
 
 
 def worst(verdicts: Iterable[str | None]) -> str | None:
@@ -58,6 +63,11 @@ class RegionCell:
     def verdict(self) -> str | None:
         return self.image.verdict if self.image else None
 
+    @property
+    def went_wrong(self) -> bool:
+        """True if the last attempt to scan it gave nothing."""
+        return self.region.last_state in (ScanState.FAILED, ScanState.INTERRUPTED)  # type: ignore[attr-defined]
+
 
 @dataclass(frozen=True)
 class ToolRow:
@@ -77,10 +87,13 @@ class ToolRow:
 
     @property
     def reason(self) -> str:
-        """Why the verdict is what it is: the first sentence of the worst region."""
+        """Why the verdict is what it is: the first sentence of the worst region, or why there is none."""
         for cell in self.regions:
             if cell.image and cell.verdict == self.verdict and cell.image.verdict_reasons:
                 return f"{cell.region.name}: {cell.image.verdict_reasons[0]}"
+        wrong = [cell.region.name for cell in self.regions if cell.went_wrong]
+        if wrong and not self.verdict:
+            return f"The last scan of {', '.join(wrong)} failed."
         unscanned = [cell.region.name for cell in self.regions if cell.image is None]
         if self.edge and unscanned and self.edge.kind in Event.SEGMENT_ENDS:
             return f"Not scanned since it was {self.edge.get_kind_display().lower()}."
@@ -138,7 +151,7 @@ def _rows(tools: list[Tool]) -> list[ToolRow]:
     for schedule in Schedule.objects.filter(tool__in=ids, enabled=True).order_by("-next_due"):
         schedules[schedule.tool_id] = schedule  # the earliest comes last and stays
     live: dict[int, list[Scan]] = defaultdict(list)
-    for scan in Scan.objects.filter(state__in=LIVE, region__tool__in=ids).select_related("region"):
+    for scan in Scan.objects.filter(state__in=LIVE, region__tool__in=ids).select_related("region").order_by("region__name"):
         live[scan.region.tool_id].append(scan)
     return [
         ToolRow(

@@ -7,6 +7,8 @@ would grow a false slope around itself.
 
 from __future__ import annotations
 
+import os
+import zipfile
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -75,8 +77,23 @@ def file_of(image: RangeImage) -> Path:
     return Path(settings.RANGES) / image.file
 
 
+def _written_at(file: str) -> int:
+    """Part of the cache's key, so that a file restored, replaced or lost is noticed."""
+    try:
+        return os.stat(file).st_mtime_ns
+    except OSError as error:
+        raise _unreadable(file, error) from error
+
+
+def _unreadable(file: str, error: Exception) -> BadInput:
+    return BadInput(
+        f"The range image file {Path(file).name} cannot be read ({type(error).__name__}); restore it from the backup or "
+        "compute the scan again."
+    )
+
+
 @lru_cache(maxsize=6)
-def _arrays(file: str, sha256: str) -> dict[str, Float32]:
+def _arrays(file: str, written_at: int) -> dict[str, Float32]:
     try:
         with np.load(file, allow_pickle=False) as stored:
             return {
@@ -84,17 +101,14 @@ def _arrays(file: str, sha256: str) -> dict[str, Float32]:
                 "intensity": stored["intensity"].astype(np.float32),
                 "width": stored["width_px"].astype(np.float32),
             }
-    except (OSError, KeyError, ValueError) as error:
-        raise BadInput(
-            f"The range image file {Path(file).name} cannot be read ({type(error).__name__}); restore it from the "
-            "backup or compute the scan again."
-        ) from error
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise _unreadable(file, error) from error
 
 
 @lru_cache(maxsize=6)
-def _reference(file: str, sha256: str, stored: tuple[float, ...] | None, pitches: tuple[float, float]) -> Float32:
+def _reference(file: str, written_at: int, stored: tuple[float, ...] | None, pitches: tuple[float, float]) -> Float32:
     """The plane under the surface, from the surface report or, for images without one, fitted now."""
-    height = _arrays(file, sha256)["height"]
+    height = _arrays(file, written_at)["height"]
     if stored is None:
         try:
             return fit_plane(height, *pitches).height_um()
@@ -132,12 +146,13 @@ def values(image: RangeImage, channel: str) -> Float32:
     if channel not in CHANNELS:
         raise BadInput(f"There is no channel “{channel}”; choose one of {', '.join(CHANNELS)}.")
     file = str(file_of(image))
-    arrays = _arrays(file, image.sha256)
+    written_at = _written_at(file)
+    arrays = _arrays(file, written_at)
     if channel != "level":
         measured = arrays[channel]
         return measured if channel == "height" else np.where(np.isfinite(arrays["height"]), measured, np.float32(np.nan))
     pitches = (image.row_pitch_um, image.profile_pitch_um)
-    return arrays["height"] - _reference(file, image.sha256, _stored_plane(image), pitches)
+    return arrays["height"] - _reference(file, written_at, _stored_plane(image), pitches)
 
 
 def area_mean(data: Float32, rows: int, columns: int) -> Float32:

@@ -12,7 +12,7 @@ from django.utils import timezone
 from inspection.models import Damage, PrecisionReport, RangeImage, Recomputation, Scan
 from inspection.selectors.queue import expected_end, reason_for_waiting, seconds_per_step
 from inspection.selectors.range_view import damage_box
-from inspection.selectors.tool import Number, numbers
+from inspection.selectors.tool import Number, key_numbers, numbers
 from inspection.states import ScanState
 
 
@@ -101,6 +101,10 @@ class Result:
     damages: list[DamageRow]
     precision: PrecisionReport | None
     newest: bool
+
+    @property
+    def key_numbers(self) -> list[Number]:
+        return key_numbers(self.numbers)
 
     def shapes(self) -> list[dict[str, Any]]:
         """Damage outlines for the picture, JSON-ready."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import datetime as dt
 import json
 import math
+import re
 from typing import Any, Final
 
 from django import template
@@ -129,8 +130,17 @@ def significant(value: float, digits: int) -> str:
     if value == 0:
         return "0"
     decimals = digits - 1 - math.floor(math.log10(abs(value)))
-    rounded = round(value, decimals)
-    return f"{rounded:.{max(decimals, 0)}f}"
+    return _written(value, decimals)
+
+
+def _written(value: float, decimals: int) -> str:
+    """Rounded, and never a minus before nothing but zeros."""
+    return f"{round(value, decimals) + 0.0:.{max(decimals, 0)}f}"
+
+
+def trimmed(text: str) -> str:
+    """Without the zeros that say nothing: 64.00 -> 64."""
+    return text.rstrip("0").rstrip(".") if "." in text else text
 
 
 def with_uncertainty(value: float | None, u: float | None) -> tuple[str, str]:
@@ -143,12 +153,10 @@ def with_uncertainty(value: float | None, u: float | None) -> tuple[str, str]:
         return "", ""
     assert value is not None
     if u is None or not is_number(u) or u <= 0:
-        return significant(value, 4), ""
+        return trimmed(significant(value, 4)), ""
     expanded = 2 * u
     decimals = 1 - math.floor(math.log10(expanded))
-    shown = round(expanded, decimals)
-    places = max(decimals, 0)
-    return f"{round(value, decimals):.{places}f}", f"{shown:.{places}f}"
+    return _written(value, decimals), _written(expanded, decimals)
 
 
 @register.simple_tag
@@ -162,15 +170,25 @@ def quantity(value: float | None, u: float | None = None, unit: str = "") -> Saf
     return format_html('{} <span class="unit">{}</span>', text, pretty_unit(unit))
 
 
+#: Records and files spell units in ASCII; people read them as they are printed elsewhere.
+UNITS: Final[dict[str, str]] = {"um": "µm", "um2": "µm²", "mm2": "mm²", "mm3": "mm³", "um3": "µm³"}
+
+
 @register.filter
 def pretty_unit(unit: str) -> str:
-    return {"um": "µm", "um2": "µm²", "mm2": "mm²", "mm3": "mm³", "1": "", "deg": "°"}.get(unit, unit)
+    return {**UNITS, "1": "", "deg": "°"}.get(unit, unit)
+
+
+@register.filter
+def with_units(sentence: str) -> str:
+    """A sentence of the measuring side with its units as people write them."""
+    return re.sub(r"(?<=[\d ])(um|mm)([23]?)\b", lambda found: UNITS.get(found[0], found[0]), sentence)
 
 
 @register.filter
 def figure(value: Any, digits: int = 3) -> str | SafeString:
-    """A plain number with so many significant digits."""
-    return significant(float(value), digits) if is_number(value) else NOT_MEASURED
+    """A plain number with at most so many significant digits."""
+    return trimmed(significant(float(value), digits)) if is_number(value) else NOT_MEASURED
 
 
 @register.filter
@@ -184,6 +202,8 @@ def percent(share: Any) -> str | SafeString:
     if not is_number(share):
         return NOT_MEASURED
     value = 100 * share
+    if 0 < value < 0.01:
+        return "below 0.01 %"
     return f"{value:.0f} %" if value >= 10 else f"{value:.2f} %" if 0 < value < 1 else f"{value:.1f} %"
 
 
@@ -283,7 +303,7 @@ def due_tone(schedule: Schedule) -> str:
 
 @register.filter
 def add_mm(start: float, length: float) -> str:
-    return significant(start + length, 4)
+    return trimmed(significant(start + length, 4))
 
 
 @register.filter
@@ -310,7 +330,21 @@ def operations(definition: dict[str, Any]) -> str:
 
 
 @register.filter
-def changes(event: AuditEvent) -> list[tuple[str, tuple[Any, Any]]]:
-    """(name, (before, after)) of everything an audit line holds."""
+def changes(event: AuditEvent) -> list[tuple[str, str]]:
+    """(name, "before → after") of everything an audit line holds; one side alone when the other is not recorded."""
     before, after = event.before or {}, event.after or {}
-    return [(key, (before.get(key), after.get(key, "removed"))) for key in dict.fromkeys([*before, *after])]
+    lines = []
+    for key in dict.fromkeys([*before, *after]):
+        sides = [_said(side[key]) for side in (before, after) if key in side]
+        lines.append((key, " → ".join(sides) if key in after else f"was {sides[0]}"))
+    return lines
+
+
+def _said(value: Any) -> str:
+    return ", ".join(_said(part) for part in value) if isinstance(value, list) else "none" if value is None else str(value)
+
+
+@register.filter
+def rule(schedule: Schedule) -> str:
+    """``every week``, ``every 2 months``."""
+    return f"every {schedule.unit.removesuffix('s')}" if schedule.every == 1 else f"every {schedule.every} {schedule.unit}"

@@ -8,7 +8,7 @@ from django.http import Http404, HttpResponse, HttpResponseNotModified, JsonResp
 from django.views.decorators.http import require_safe
 
 from inspection.models import RangeImage, Scan
-from inspection.selectors.range_view import Window, cut, difference, picture, values, whole
+from inspection.selectors.range_view import Picture, Window, cut, difference, picture, values, whole
 from inspection.views.signed_in import SignedIn, found
 from scanning.errors import BadInput, Fault
 
@@ -52,6 +52,11 @@ def _bad(fault: Fault) -> HttpResponse:
     return JsonResponse({"detail": str(fault)}, status=400)
 
 
+def _bytes(drawn: Picture, headers: dict[str, str]) -> HttpResponse:
+    counts = drawn.counts.astype("<i2").tobytes()
+    return HttpResponse(counts, content_type="application/octet-stream", headers={**drawn.headers(), **headers})
+
+
 @require_safe
 def scan_range(request: SignedIn, pk: int) -> HttpResponse:
     """``range.i2``: little-endian int16, row by row; `Picture.headers` says what the counts mean."""
@@ -67,9 +72,7 @@ def scan_range(request: SignedIn, pk: int) -> HttpResponse:
         drawn = picture(values(image, channel), image, channel, Window(row, row_end, profile, profile_end), _most(request))
     except Fault as fault:
         return _bad(fault)
-    response = HttpResponse(drawn.counts.astype("<i2").tobytes(), content_type="application/octet-stream")
-    response.headers.update({**drawn.headers(), "ETag": tag, "Cache-Control": "private, max-age=31536000, immutable"})
-    return response
+    return _bytes(drawn, {"ETag": tag, "Cache-Control": "private, max-age=31536000, immutable"})
 
 
 @require_safe
@@ -92,6 +95,4 @@ def scan_difference(request: SignedIn, pk: int) -> HttpResponse:
         drawn = picture(changed, newer, "level", whole(newer), _most(request))
     except Fault as fault:
         return _bad(fault)
-    response = HttpResponse(drawn.counts.astype("<i2").tobytes(), content_type="application/octet-stream")
-    response.headers.update({**drawn.headers(), "Cache-Control": "private, max-age=3600"})
-    return response
+    return _bytes(drawn, {"Cache-Control": "private, max-age=3600"})

@@ -9,7 +9,7 @@ from django.http import HttpResponse, HttpResponseNotModified
 from django.shortcuts import redirect, render
 from django.views.decorators.http import require_POST, require_safe
 
-from inspection.models import Inspection, RangeImage, Recipe, Scan, User
+from inspection.models import Inspection, Measurement, RangeImage, Recipe, Scan, User
 from inspection.selectors.overview import worst
 from inspection.selectors.range_view import CHANNELS
 from inspection.selectors.scan import ScanPage, comparable, progress, progress_version, scan_state
@@ -145,17 +145,17 @@ def scan_compare(request: SignedIn, pk: int) -> HttpResponse:
     rows = []
     if mine and chosen:
         before = {m.metric: m for m in chosen.measurements.all()}
-        rows = [
-            {"now": m, "before": before[m.metric], "delta": _delta(m.value, before[m.metric].value), "u": _joint_u(m.u, before[m.metric].u)}
-            for m in mine.measurements.all()
-            if m.metric in before
-        ]
+        rows = [_changed(m, before[m.metric]) for m in mine.measurements.all() if m.metric in before]
     context = {"scan": scan, "tool": scan.region.tool, "mine": mine, "other": chosen, "others": others, "rows": rows}
     return render(request, "scan/compare.html", context)
 
 
-def _delta(now: float | None, before: float | None) -> float | None:
-    return None if now is None or before is None else now - before
+def _changed(now: Measurement, before: Measurement) -> dict[str, Any]:
+    """One metric then and now. A change is real when it is larger than its own expanded uncertainty (k = 2)."""
+    delta = None if now.value is None or before.value is None else now.value - before.value
+    u = _joint_u(now.u, before.u)
+    real = delta is not None and u is not None and abs(delta) > 2 * u
+    return {"now": now, "before": before, "delta": delta, "u": u, "real": real}
 
 
 def _joint_u(a: float | None, b: float | None) -> float | None:

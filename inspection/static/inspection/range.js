@@ -11,7 +11,24 @@ const rowMm = panel.dataset.rowUm / 1000;
 const profileMm = panel.dataset.profileUm / 1000;
 const rows = Number(panel.dataset.rows);
 const profiles = Number(panel.dataset.profiles);
-const whole = { x: [-profileMm / 2, (profiles - 0.5) * profileMm], y: [(rows - 0.5) * rowMm, -rowMm / 2] };
+// "Along" is the scan and the edge, "across" the laser line. An image much longer across is drawn lying on its side.
+const along = { title: "along the edge, mm", step: profileMm, count: profiles, low: -profileMm / 2, high: (profiles - 0.5) * profileMm };
+const across = { title: "across the bevel, mm", step: rowMm, count: rows, low: -rowMm / 2, high: (rows - 0.5) * rowMm };
+const turned = across.high > 1.3 * along.high;
+const [flat, upright] = turned ? [across, along] : [along, across];
+const whole = { x: [flat.low, flat.high], y: [upright.high, upright.low] };
+const fit = () => {
+  const room = map.clientWidth - 150;
+  map.style.height = `${Math.min(640, Math.max(280, (room * (upright.high - upright.low)) / (flat.high - flat.low) + 70))}px`;
+};
+/** A picture as plotly takes it, turned if the map is. */
+function laid({ z, x0, y0, dx, dy }) {
+  if (!turned) return { z, x0, dx, y0, dy };
+  const lying = Array.from(z[0], (_, column) => Float32Array.from(z, (row) => row[column]));
+  return { z: lying, x0: y0, dx: dy, y0: x0, dy: dx };
+}
+/** A point given as (along, across) in plot coordinates. */
+const place = (a, b) => (turned ? [b, a] : [a, b]);
 //: Cells along the longer side that a weak tablet still draws at once.
 const CELLS = 600;
 const CELLS_3D = 240;
@@ -41,15 +58,16 @@ function damageShapes() {
   return shapes.map((damage) => {
     const line = { color: "#e4572e", width: 2 };
     const outline = damage.outline?.length
-      ? damage.outline.map((points) => `M${points.map(([x, y]) => `${x},${y}`).join("L")}Z`).join("")
+      ? damage.outline.map((points) => `M${points.map(([x, y]) => place(x, y).join(",")).join("L")}Z`).join("")
       : null;
-    const { x0, x1, y0, y1 } = damage;
+    const [x0, y0] = place(damage.x0, damage.y0);
+    const [x1, y1] = place(damage.x1, damage.y1);
     return outline ? { type: "path", path: outline, line } : { type: "rect", x0, x1, y0, y1, line };
   });
 }
 
 const labels = () => shapes.map((damage) => ({
-  x: damage.x1, y: damage.y0, text: `<b>${damage.number}</b>`, showarrow: false, xanchor: "left", yanchor: "bottom",
+  x: place(damage.x1, damage.y1)[0], y: place(damage.x0, damage.y0)[1], text: `<b>${damage.number}</b>`, showarrow: false, xanchor: "left", yanchor: "bottom",
   font: { color: "#fff", size: 14 }, bgcolor: "#c2401b", borderpad: 2,
 }));
 
@@ -70,8 +88,8 @@ const layout = () => look({
   uirevision: "stay",
   dragmode: "zoom",
   margin: { l: 58, r: 8, t: 8, b: 46 },
-  xaxis: { title: { text: "along the edge, mm" }, range: whole.x, minallowed: whole.x[0], maxallowed: whole.x[1], showgrid: false, zeroline: false, constrain: "domain" },
-  yaxis: { title: { text: "across the bevel, mm" }, range: whole.y, minallowed: whole.y[1], maxallowed: whole.y[0], showgrid: false, zeroline: false, scaleanchor: "x", constrain: "domain" },
+  xaxis: { title: { text: flat.title }, range: whole.x, minallowed: whole.x[0], maxallowed: whole.x[1], showgrid: false, zeroline: false, constrain: "domain" },
+  yaxis: { title: { text: upright.title }, range: whole.y, minallowed: whole.y[1], maxallowed: whole.y[0], showgrid: false, zeroline: false, scaleanchor: "x", constrain: "domain" },
 });
 
 async function draw() {
@@ -83,10 +101,12 @@ async function draw() {
     const unit = unitWord(picture.unit);
     const bar = { title: { text: unit, side: "top" }, thickness: 14, outlinewidth: 0 };
     const colorscale = channel === "level" || channel === "height" ? "Viridis" : "Cividis";
-    const common = { z: picture.z, x0: picture.x0, dx: picture.dx, y0: picture.y0, dy: picture.dy, colorscale, colorbar: bar };
+    const common = { ...laid(picture), colorscale, colorbar: bar };
     const { zmin, zmax } = scaleOf(picture);
     wait.remove();
+    fit();
     if (solid) {
+      map.style.height = "480px";
       const axis = (index, count, step, start) => Array.from({ length: count }, (_, i) => start + i * step);
       Plotly.purge(map);
       await Plotly.newPlot(map, [{
@@ -104,7 +124,7 @@ async function draw() {
     }
     await Plotly.newPlot(map, [{
       type: "heatmap", ...common, zmin, zmax, zsmooth: false, hoverongaps: false,
-      hovertemplate: `%{x:.3f} mm along<br>%{y:.3f} mm across<br><b>%{z:.1f} ${unit}</b><extra></extra>`,
+      hovertemplate: `${flat.title.split(" ")[0]} %{x:.3f} mm<br>${upright.title.split(" ")[0]} %{y:.3f} mm<br><b>%{z:.1f} ${unit}</b><extra></extra>`,
     }], layout(), config);
     map.removeAllListeners?.("plotly_relayout");
     map.on("plotly_relayout", zoomed);
@@ -133,17 +153,18 @@ function zoomed(change) {
 async function refine() {
   const mine = ++latest;
   const [x, y] = [map.layout.xaxis.range, map.layout.yaxis.range];
-  const span = (range, step, count) => {
-    const [low, high] = [Math.min(...range) / step, Math.max(...range) / step];
-    return [Math.max(0, Math.floor(low)), Math.min(count, Math.ceil(high) + 1)];
+  const span = (range, axis) => {
+    const [low, high] = [Math.min(...range) / axis.step, Math.max(...range) / axis.step];
+    return [Math.max(0, Math.floor(low)), Math.min(axis.count, Math.ceil(high) + 1)];
   };
-  const window = { rows: span(y, rowMm, rows), cols: span(x, profileMm, profiles) };
+  const [cols, rowSpan] = place(span(x, flat), span(y, upright));
+  const window = { rows: rowSpan, cols };
   if (window.rows[0] >= window.rows[1] || window.cols[0] >= window.cols[1]) return;
   try {
     const picture = await fetchPicture(address(CELLS, window));
     if (mine !== latest || solid) return;
     const { zmin, zmax } = scaleOf(picture);
-    await Plotly.restyle(map, { z: [picture.z], x0: picture.x0, dx: picture.dx, y0: picture.y0, dy: picture.dy, zmin, zmax });
+    await Plotly.restyle(map, { ...laid(picture), z: [laid(picture).z], zmin, zmax });
   } catch (error) {
     panel.querySelector("[data-cut-words]").textContent = error.message;
   }
@@ -158,10 +179,11 @@ function reset() {
 }
 
 async function clicked(event) {
-  const { x, y } = event.points[0];
+  const [x, y] = place(event.points[0].x, event.points[0].y);  // turning twice is not turning
   const row = Math.min(rows - 1, Math.max(0, Math.round(y / rowMm)));
   const profile = Math.min(profiles - 1, Math.max(0, Math.round(x / profileMm)));
-  point = { x: profile * profileMm, y: row * rowMm };
+  const [x1, y1] = place(profile * profileMm, row * rowMm);
+  point = { x: x1, y: y1, along: profile * profileMm, across: row * rowMm };
   Plotly.relayout(map, { shapes: [...damageShapes(), ...crosshair()] });
   const query = new URLSearchParams({ row, col: profile, channel, result: panel.dataset.result });
   const answer = await fetch(`${panel.dataset.cut}?${query}`);
@@ -169,9 +191,9 @@ async function clicked(event) {
   cuts.hidden = false;
   const words = panel.querySelector("[data-cut-words]");
   if (!answer.ok) { words.textContent = cut.detail; return; }
-  words.textContent = `Profiles through row ${row} (${point.y.toFixed(3)} mm across) and profile ${profile} (${point.x.toFixed(3)} mm along)`;
-  profileChart(panel.querySelector("[data-along]"), cut.along, "along the edge, mm", point.x, cut.unit);
-  profileChart(panel.querySelector("[data-across]"), cut.across, "across the bevel, mm", point.y, cut.unit);
+  words.textContent = `Profiles through row ${row} (${point.across.toFixed(3)} mm across) and profile ${profile} (${point.along.toFixed(3)} mm along)`;
+  profileChart(panel.querySelector("[data-along]"), cut.along, along.title, point.along, cut.unit);
+  profileChart(panel.querySelector("[data-across]"), cut.across, across.title, point.across, cut.unit);
 }
 
 function profileChart(element, line, title, here, unit) {
@@ -203,12 +225,14 @@ for (const row of document.querySelectorAll("tr[data-damage]")) {
     if (!damage || solid) return;
     for (const other of document.querySelectorAll("tr[data-damage]")) other.classList.toggle("chosen", other === row);
     const room = 0.35 * Math.max(damage.x1 - damage.x0, damage.y1 - damage.y0) + 0.1;
-    show(Math.max(whole.x[0], damage.x0 - room), Math.min(whole.x[1], damage.x1 + room),
-      Math.max(whole.y[1], damage.y0 - room), Math.min(whole.y[0], damage.y1 + room));
+    const [x0, y0] = place(damage.x0 - room, damage.y0 - room);
+    const [x1, y1] = place(damage.x1 + room, damage.y1 + room);
+    show(Math.max(flat.low, x0), Math.min(flat.high, x1), Math.max(upright.low, y0), Math.min(upright.high, y1));
     panel.scrollIntoView({ block: "start" });
   };
   row.addEventListener("click", go);
   row.addEventListener("keydown", (event) => { if (event.key === "Enter") go(); });
 }
 document.addEventListener("theme", () => draw());
+fit();
 draw();

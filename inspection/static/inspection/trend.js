@@ -73,6 +73,15 @@ function fitTraces(one, index) {
   return traces;
 }
 
+// The readings and the limits decide what is seen, not the width of a forecast's band.
+function reach(series) {
+  const limits = [series[0].limits?.watch, series[0].limits?.replace].filter((v) => typeof v === "number");
+  const points = series.flatMap((one) => one.points).filter((p) => p.value !== null);
+  const high = Math.max(...points.map((p) => p.value + 2 * (p.u ?? 0)), series[0].limits?.watch ?? 0);
+  const top = Math.max(high, ...limits.filter((v) => v < 3 * high)) * 1.12 || 1;
+  return [Math.min(0, ...points.map((p) => p.value - 2 * (p.u ?? 0))), top];
+}
+
 function layout(series, unit) {
   const shapes = [];
   const annotations = [];
@@ -92,7 +101,7 @@ function layout(series, unit) {
   }
   return look({
     shapes, annotations, uirevision: "stay", hovermode: "closest", legend: { orientation: "h", y: 1.12, x: 0 }, margin: { l: 62, r: 16, t: 34, b: 40 },
-    xaxis: { type: "date" }, yaxis: { title: { text: `${series[0].metric.label}, ${unit}` }, rangemode: "tozero" },
+    xaxis: { type: "date" }, yaxis: { title: { text: `${series[0].metric.label}, ${unit}` }, range: reach(series) },
   });
 }
 

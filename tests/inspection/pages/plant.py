@@ -51,7 +51,7 @@ from scanning.range_image import RangeImage as Heights
 from scanning.surface import SurfaceReport, inspect_surface
 
 ROW_UM, PROFILE_UM = 7.150838, 8.33
-#: Table 2 of the paper: heights of the feeler-gauge stair and where IS1 saw them.
+#: A stair of feeler gauges as an imaging system like IS1 sees it.
 GAUGE_PAIRS = """height_mm,column_px
 0.140,9.5
 0.210,15.2
