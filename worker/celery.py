@@ -17,9 +17,9 @@ os.environ.setdefault("DJANGO_SETTINGS_MODULE", "inspection.settings")
 if not apps.ready:
     django.setup()
 
-from django.conf import settings  # noqa: E402 - the settings must be chosen first
+from django.conf import settings
 
-from inspection.services.ring import COMPUTE_QUEUE, broker_options  # noqa: E402
+from inspection.services.ring import COMPUTE_QUEUE, broker_options
 
 #: The tick is late at worst by this; a second one waiting behind a busy worker says nothing new.
 TICK_EVERY_S = 60.0

@@ -62,7 +62,8 @@ def measure(scan_id: int) -> None:
         try:
             if attempt > MOST_ATTEMPTS:
                 raise BadInput(
-                    f"Computing was started {MOST_ATTEMPTS} times and never came to an end; see the compute worker's log."
+                    f"Computing was started {MOST_ATTEMPTS} times and never came to an end; see the compute worker's "
+                    f"log."
                 )
             scan = Scan.objects.select_related("recipe", "calibration", "limit_set", "region__tool", "inspection").get(
                 pk=scan_id

@@ -42,7 +42,9 @@ class LeaseLostError(Exception):
 class Lease:
     """A held scan. ``clock`` (monotonic seconds) judges by itself when a database that does not answer has cost it."""
 
-    def __init__(self, scan_id: int, token: UUID, rig_id: int | None, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, scan_id: int, token: UUID, rig_id: int | None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self.scan_id = scan_id
         self.token = token
         self._rig_id = rig_id

@@ -57,7 +57,8 @@ class LiveRangeImage:
         count = self._profiles
         if count == 0:
             raise BadInput(
-                f"The scan ended after {self._steps} steps, too few for a single profile with {self._recipe.name}; scan again."
+                f"The scan ended after {self._steps} steps, too few for a single profile with {self._recipe.name}; "
+                f"scan again."
             )
         provenance = self._stream.provenance()
         provenance["header"]["steps"] = self._steps

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import socket
-from typing import Any
+from typing import Any, cast
 
 from celery import signals
 from celery.worker.consumer import Consumer
@@ -16,12 +16,13 @@ from django.db import DatabaseError, connection
 from django.utils import timezone
 
 from inspection.models import Rig
-from inspection.services.ring import RING_EXPIRES_S, ring, rig_queue
+from inspection.services.ring import RING_EXPIRES_S, rig_queue, ring
 from inspection.states import ScanState
+from scanning.rig.rig import open_rig
 from worker import stopping
 from worker.celery import app
 from worker.lease import claim, sweep
-from worker.scan import OpenRig, open_rig, run_scan
+from worker.scan import OpenRig, run_scan
 
 log = logging.getLogger(__name__)
 
@@ -57,12 +58,13 @@ def serve(rig_slug: str, *, opening: OpenRig = open_rig) -> list[str]:
     return states
 
 
-@signals.worker_ready.connect  # type: ignore[untyped-decorator]
+@signals.worker_ready.connect
 def show_up(sender: Consumer, **_: Any) -> None:
     """Show at once and from then on that somebody serves the rig, and ring for what waited while nobody did.
 
     On the event loop's own timer, because a second thread in the parent could hold a lock at the moment a child is
-    forked. The loop starts again, and this with it, after every loss of the broker: a worker that cannot hear is not seen.
+    forked. The loop starts again, and this with it, after every loss of the broker: a worker that cannot hear is not
+    seen.
     """
     for slug in slugs_served(sender):
         stopping.forget()
@@ -73,7 +75,7 @@ def show_up(sender: Consumer, **_: Any) -> None:
         ring(slug)
 
 
-@signals.worker_shutting_down.connect  # type: ignore[untyped-decorator]
+@signals.worker_shutting_down.connect
 def go_down(**_: Any) -> None:
     """Let a running scan end at its next step instead of waiting for its last."""
     stopping.ask_to_stop()
@@ -81,7 +83,7 @@ def go_down(**_: Any) -> None:
 
 def slugs_served(consumer: Consumer) -> list[str]:
     """The rigs whose queues this worker consumes."""
-    names = [str(queue.name) for queue in consumer.task_consumer.queues]
+    names = [str(queue.name) for queue in cast(Any, consumer).task_consumer.queues]
     return [name.removeprefix(QUEUE_PREFIX) for name in names if name.startswith(QUEUE_PREFIX)]
 
 

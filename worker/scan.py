@@ -52,7 +52,7 @@ HARDWARE = ("stage", "laser", "camera")
 OpenRig = Callable[[Mapping[str, Any]], AbstractContextManager[Rig]]
 
 
-class WorkerGoingDown(Exception):  # noqa: N818 - not an error: somebody stopped the worker
+class WorkerGoingDown(Exception):
     """The worker must end; the scan is given up at this step."""
 
 
@@ -198,8 +198,8 @@ class _Run:
         except WorkerGoingDown as reason:
             return self._end(
                 ScanState.INTERRUPTED,
-                f"{str(reason).capitalize()} at step {self._done()} of {self.scan.total}; the rig is dark and parked, so "
-                f"resume the queue and scan again.",
+                f"{str(reason).capitalize()} at step {self._done()} of {self.scan.total}; the rig is dark and parked, "
+                f"so resume the queue and scan again.",
             )
         except Fault as fault:
             return self._end(ScanState.FAILED, str(fault))

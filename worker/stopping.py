@@ -1,9 +1,9 @@
 """Tells the process that drives the rig that its worker is going down.
 
-Celery runs tasks in a child process. When the parent is asked to stop, the child would finish its scan first, which can
-take half an hour. It is noticed here at the next step, and the scan ends with the laser off and the stage parked. A parent
-that is killed takes its child along on Linux (Celery asks the kernel for that); elsewhere the child would go on alone,
-with nobody to stop it, so that is noticed too.
+Celery runs tasks in a child process. When the parent is asked to stop, the child would finish its scan first, which
+can take half an hour. It is noticed here at the next step, and the scan ends with the laser off and the stage parked.
+A parent that is killed takes its child along on Linux (Celery asks the kernel for that); elsewhere the child would go
+on alone, with nobody to stop it, so that is noticed too.
 """
 
 from __future__ import annotations

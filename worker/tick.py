@@ -48,14 +48,18 @@ def sweep() -> None:
 
 def ring_what_waits(now: dt.datetime) -> None:
     """Ring for every rig with a queued scan and for every computation that nobody is at."""
-    for slug in Rig.objects.filter(
-        active=True, queue_state=QueueState.READY, scans__state=ScanState.QUEUED
-    ).distinct().values_list("slug", flat=True):
+    for slug in (
+        Rig.objects.filter(active=True, queue_state=QueueState.READY, scans__state=ScanState.QUEUED)
+        .distinct()
+        .values_list("slug", flat=True)
+    ):
         ring(slug)
     free = Q(lease_until__isnull=True) | Q(lease_until__lt=now)
     late = Q(progress_at__isnull=True) | Q(progress_at__lt=now - COMPUTE_PATIENCE)
     for scan_id in Scan.objects.filter(free, late, state=ScanState.PROCESSING).values_list("pk", flat=True):
         ring_measure(scan_id)
     lost = Q(state=Recomputation.State.RUNNING, started_at__lt=now - RECOMPUTATION_LOST)
-    for order_id in Recomputation.objects.filter(lost | Q(state=Recomputation.State.QUEUED)).values_list("pk", flat=True):
+    for order_id in Recomputation.objects.filter(lost | Q(state=Recomputation.State.QUEUED)).values_list(
+        "pk", flat=True
+    ):
         ring_recompute(order_id)

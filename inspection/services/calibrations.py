@@ -120,4 +120,6 @@ def _read(csv_file: NamedFile | BinaryIO | TextIO | Path | str) -> tuple[str, st
     try:
         return raw.decode("utf-8-sig"), where
     except UnicodeDecodeError:
-        raise BadInput(f"{where} is not a text file; save the pairs as CSV with columns height_mm and column_px.") from None
+        raise BadInput(
+            f"{where} is not a text file; save the pairs as CSV with columns height_mm and column_px."
+        ) from None

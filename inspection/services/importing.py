@@ -13,7 +13,7 @@ import zipfile
 import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path, PurePosixPath
-from typing import Any, Protocol
+from typing import IO, Any, Protocol
 from uuid import uuid4
 
 from django.conf import settings
@@ -58,8 +58,8 @@ def import_stack(
 ) -> Scan:
     """Store the stack in ``folder`` (contract 2 of the design, or our HDF5 file) as a scan and ring for its numbers.
 
-    ``calibration`` is given only when the stack was recorded on that rig with that setting; otherwise heights rest on the
-    stack's own mm_per_pixel, and the verdict says that nobody vouches for it. ``recipe`` defaults to what fits the
+    ``calibration`` is given only when the stack was recorded on that rig with that setting; otherwise heights rest on
+    the stack's own mm_per_pixel, and the verdict says that nobody vouches for it. ``recipe`` defaults to what fits the
     stack's exposures. Raises `BadInput` in one sentence; then neither a file nor a row remains.
     """
     place = f"imported/{timezone.now():%Y/%m}/{uuid4().hex}.h5"
@@ -157,7 +157,8 @@ def _check_fits(recipe: Recipe, header: StackHeader) -> None:
     working.check_fits(header)
     if working.profiles(header.steps) < 1:
         raise BadInput(
-            f"The stack has {header.steps} steps, too few for a single profile with {recipe.name}; choose NF or record more."
+            f"The stack has {header.steps} steps, too few for a single profile with {recipe.name}; choose NF or "
+            f"record more."
         )
 
 
@@ -220,8 +221,8 @@ def _write(target: Path, pieces: Iterable[bytes], room: int) -> int:
             written += len(piece)
             if written > room:
                 raise BadInput(
-                    f"The upload is larger than {settings.STACK_UPLOAD_MAX_BYTES // 2**20} MB; import it from the command "
-                    f"line instead, or raise STACK_UPLOAD_MAX_MB."
+                    f"The upload is larger than {settings.STACK_UPLOAD_MAX_BYTES // 2**20} MB; import it from the "
+                    f"command line instead, or raise STACK_UPLOAD_MAX_MB."
                 )
             out.write(piece)
     return written
@@ -243,9 +244,14 @@ def _unzip(archive: Path, inside: Path, name: str) -> None:
                 if target.exists():
                     raise BadInput(f"{name} holds {entry.filename} twice; make the archive again.")
                 with opened.open(entry) as packed:
-                    room -= _write(target, iter(lambda packed=packed: packed.read(PIECE_BYTES), b""), room)
+                    room -= _write(target, _pieces(packed), room)
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError, ValueError) as error:
         raise BadInput(f"{name} cannot be unpacked ({error}); make the archive again, without a password.") from error
+
+
+def _pieces(packed: IO[bytes]) -> Iterator[bytes]:
+    while piece := packed.read(PIECE_BYTES):
+        yield piece
 
 
 def _clutter(name: str) -> bool:
@@ -257,7 +263,9 @@ def _clutter(name: str) -> bool:
 def _target(inside: Path, entry: zipfile.ZipInfo, name: str) -> Path:
     inner = PurePosixPath(entry.filename.replace("\\", "/"))
     if inner.is_absolute() or ".." in inner.parts or ":" in entry.filename or "\0" in entry.filename:
-        raise BadInput(f"{name} holds the path {entry.filename!r}, which leads out of the archive; it was not unpacked.")
+        raise BadInput(
+            f"{name} holds the path {entry.filename!r}, which leads out of the archive; it was not unpacked."
+        )
     if stat.S_ISLNK(entry.external_attr >> 16):
         raise BadInput(f"{name} holds the link {entry.filename!r}; put the file itself into the archive.")
     return inside.joinpath(*inner.parts)

@@ -36,8 +36,8 @@ def set_limits(
 ) -> LimitSet:
     """Put a new limit set in force: ``{metric: (watch_above, replace_above, unit)}``, either limit may be None.
 
-    ``reason`` is demanded. Raises `BadInput` for an empty set, a limit that is not a positive number, or a replace limit
-    below its watch limit. Metrics left out have no limit any more.
+    ``reason`` is demanded. Raises `BadInput` for an empty set, a limit that is not a positive number, or a replace
+    limit below its watch limit. Metrics left out have no limit any more.
     """
     reason = reason.strip()
     if not reason:
@@ -52,12 +52,12 @@ def set_limits(
             newest = LimitSet.objects.filter(tool_type=tool_type).aggregate(top=Max("version"))["top"] or 0
             row = LimitSet.objects.create(tool_type=tool_type, version=newest + 1, by=by, reason=reason[:300])
             for metric, (watch, replace, unit) in limits.items():
-                Limit.objects.create(
-                    limit_set=row, metric=metric, watch_above=watch, replace_above=replace, unit=unit
-                )
+                Limit.objects.create(limit_set=row, metric=metric, watch_above=watch, replace_above=replace, unit=unit)
             audit(by, "limits.set", tool_type, before=before, after=limits_as_data(row), reason=reason)
     except IntegrityError as error:
-        raise BadInput(f"Somebody else set the limits of {tool_type} at this moment; look at them and try again.") from error
+        raise BadInput(
+            f"Somebody else set the limits of {tool_type} at this moment; look at them and try again."
+        ) from error
     return row
 
 

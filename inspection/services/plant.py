@@ -132,7 +132,10 @@ def create_region(
     flat_row: int = 0,
     flat_rows: int = DEFAULT_FLAT_ROWS,
 ) -> Region:
-    """Add a stretch of the edge. Refused outside the edge, outside every rig's travel, or with a flat part outside it."""
+    """Add a stretch of the edge.
+
+    Refused outside the edge, outside every rig's travel, or with a flat part outside itself.
+    """
     region = Region(
         tool=tool,
         name=_name(name, "region"),
@@ -171,23 +174,24 @@ def check_region(region: Region) -> None:
     edge_mm = region.tool.tool_type.edge_length_mm
     if region.start_mm < 0 or region.length_mm <= 0 or region.start_mm + region.length_mm > edge_mm + 1e-6:
         raise BadInput(
-            f"Region {region.name} reaches from {region.start_mm:g} to {region.start_mm + region.length_mm:g} mm; it must "
-            f"lie within the tool's edge, 0 to {edge_mm:g} mm."
+            f"Region {region.name} reaches from {region.start_mm:g} to {region.start_mm + region.length_mm:g} mm; it "
+            f"must lie within the tool's edge, 0 to {edge_mm:g} mm."
         )
     reach_mm = max(Rig.objects.filter(active=True).values_list("travel_mm", flat=True), default=None)
     if reach_mm is not None and region.start_mm + region.length_mm > reach_mm + 1e-6:
         raise BadInput(
-            f"Region {region.name} ends at {region.start_mm + region.length_mm:g} mm, beyond the {reach_mm:g} mm that the "
-            f"longest stage can travel; move or shorten it."
+            f"Region {region.name} ends at {region.start_mm + region.length_mm:g} mm, beyond the {reach_mm:g} mm "
+            f"that the longest stage can travel; move or shorten it."
         )
     if not 1 <= region.rows <= 65535:
         raise BadInput(f"Region {region.name} asks for {region.rows} sensor rows; give 1 to 65535.")
     if region.row_offset < 0 or region.flat_row < 0:
         raise BadInput(f"Region {region.name} has a negative row; rows count from 0.")
-    if region.flat_rows < 3 or region.flat_row + region.flat_rows > region.rows:
+    last_flat_row = region.flat_row + region.flat_rows
+    if region.flat_rows < 3 or last_flat_row > region.rows:
         raise BadInput(
-            f"The flat part of region {region.name} is rows {region.flat_row} to {region.flat_row + region.flat_rows}; it "
-            f"needs at least 3 rows within the region's {region.rows}."
+            f"The flat part of region {region.name} is rows {region.flat_row} to {last_flat_row}; it needs at least 3 "
+            f"rows within the region's {region.rows}."
         )
 
 
@@ -203,7 +207,8 @@ def record_event(
 ) -> Event:
     """Note something done to a tool. After a regrind, a turn or a replacement its use counts from zero again.
 
-    ``life_used`` is the tool's reading at that moment (default: the one known), ``removed_mm`` the stock a regrind took.
+    ``life_used`` is the tool's reading at that moment (default: the one known), ``removed_mm`` the stock a regrind
+    took.
     """
     if kind not in Event.Kind.values:
         raise BadInput(f"There is no event {kind!r}; choose one of {', '.join(Event.Kind.values)}.")

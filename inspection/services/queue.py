@@ -60,7 +60,9 @@ def enqueue_inspection(
         raise BadInput(f"Tool {tool.code} has no region to scan; add one on the tool's page.")
     for region in chosen:
         if region.tool_id != tool.pk:
-            raise BadInput(f"Region {region.name} belongs to another tool than {tool.code}; choose from its own regions.")
+            raise BadInput(
+                f"Region {region.name} belongs to another tool than {tool.code}; choose from its own regions."
+            )
     exposures = check_exposures(exposures_us if exposures_us else rig.exposures_us, rig)
     recipe = recipe or default_recipe(rig, exposures)
     plans = [plan_for(region, rig, exposures, recipe) for region in chosen]
@@ -117,7 +119,9 @@ def check_exposures(exposures_us: Sequence[float], rig: Rig) -> list[float]:
     try:
         exposures = sorted(float(value) for value in exposures_us)
     except (TypeError, ValueError):
-        raise BadInput(f"The exposures {exposures_us!r} are not all numbers; give microseconds, such as 100, 300.") from None
+        raise BadInput(
+            f"The exposures {exposures_us!r} are not all numbers; give microseconds, such as 100, 300."
+        ) from None
     if not exposures:
         raise BadInput(f"{rig.name} has no exposures; enter its bracket in microseconds on the rig's page.")
     if not all(math.isfinite(value) and 0.0 <= value <= LONGEST_EXPOSURE_US for value in exposures):
@@ -153,8 +157,8 @@ def plan_for(region: Region, rig: Rig, exposures_us: Sequence[float], recipe: Re
     end_mm = region.start_mm + (steps - 1) * step_um / 1000.0
     if region.start_mm < 0 or end_mm > rig.travel_mm:
         raise BadInput(
-            f"Region {region.name} of {region.tool.code} reaches from {region.start_mm:g} to {end_mm:.2f} mm, outside the "
-            f"0 to {rig.travel_mm:g} mm that {rig.name} can travel; move or shorten the region."
+            f"Region {region.name} of {region.tool.code} reaches from {region.start_mm:g} to {end_mm:.2f} mm, "
+            f"outside the 0 to {rig.travel_mm:g} mm that {rig.name} can travel; move or shorten the region."
         )
     plan = {
         "region": region.name,
@@ -215,7 +219,8 @@ def check_recipe(recipe: Recipe, plan: dict[str, Any], where: str) -> None:
     )
     if working.profiles(plan["steps"]) < 1:
         raise BadInput(
-            f"{where} is {plan['steps']} steps long, too short for a single profile with {recipe.name}; lengthen the region."
+            f"{where} is {plan['steps']} steps long, too short for a single profile with {recipe.name}; lengthen the "
+            f"region."
         )
 
 
@@ -233,7 +238,7 @@ def cancel_scan(scan: Scan, by: User | None) -> None:
     now = timezone.now()
     who = f"Cancelled by {by}." if by else "Cancelled."
     with transaction.atomic():
-        asked = {"cancel_requested_at": now, "cancel_requested_by": by}
+        asked: dict[str, Any] = {"cancel_requested_at": now, "cancel_requested_by": by}
         if not move(
             scan.pk, frm=ScanState.QUEUED, to=ScanState.CANCELLED, finished_at=now, message=who, **asked
         ) and not Scan.objects.filter(pk=scan.pk, state__in=ON_RIG).update(**asked):
@@ -335,7 +340,10 @@ def reprocess(scan: Scan, by: User | None, recipe: Recipe) -> Recomputation:
 
 
 def pause_queue(rig: Rig, by: User | None, reason: str) -> None:
-    """Start nothing more on the rig until somebody resumes its queue. A running scan goes on. ``reason`` is demanded."""
+    """Start nothing more on the rig until somebody resumes its queue; a running scan goes on.
+
+    ``reason`` is demanded.
+    """
     reason = _demand(reason, "Say why the queue is paused; whoever comes next reads it.")
     with transaction.atomic():
         changed = Rig.objects.filter(pk=rig.pk, queue_state=QueueState.READY).update(

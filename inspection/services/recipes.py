@@ -14,7 +14,8 @@ DEFAULT_RECIPE = "HDRE-II"
 def recipe_row(recipe: scanning.recipe.Recipe) -> Recipe:
     """Return the row of ``recipe``, adding it if its content is new."""
     sha256 = recipe.sha256()
-    if (row := Recipe.objects.filter(sha256=sha256).first()) is not None:
+    row: Recipe | None = Recipe.objects.filter(sha256=sha256).first()
+    if row is not None:
         return row
     try:
         with transaction.atomic():

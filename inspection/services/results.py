@@ -250,8 +250,6 @@ def _add_damages(row: RangeImage, report: scanning.surface.SurfaceReport) -> Non
 
 def _add_precision(row: RangeImage, precision: scanning.precision.PrecisionReport) -> None:
     cell_scan_um, cell_row_um = precision.lateral_cell_um
-    if precision.ns_per_range_pixel is None:
-        raise ValueError("the range image was not timed")
     PrecisionReport.objects.create(
         range_image=row,
         undefined_count=precision.undefined,
@@ -261,7 +259,7 @@ def _add_precision(row: RangeImage, precision: scanning.precision.PrecisionRepor
         sigma_um=_finite(precision.sigma_um),
         cell_scan_um=cell_scan_um,
         cell_row_um=cell_row_um,
-        ns_per_range_pixel=precision.ns_per_range_pixel,
+        ns_per_range_pixel=_finite(precision.ns_per_range_pixel),
         cpu_ns_per_range_pixel=_finite(precision.cpu_ns_per_range_pixel),
         detail=precision.to_json(),
     )
@@ -280,7 +278,9 @@ def baseline_for(scan: Scan, image: scanning.range_image.RangeImage) -> RangeIma
     region: Region = scan.region
     taken = scan.started_at or scan.queued_at
     made_new = (
-        Event.objects.filter(tool_id=region.tool_id, kind__in=[*Event.SEGMENT_ENDS, Event.Kind.INSTALLED], at__lte=taken)
+        Event.objects.filter(
+            tool_id=region.tool_id, kind__in=[*Event.SEGMENT_ENDS, Event.Kind.INSTALLED], at__lte=taken
+        )
         .order_by("-at")
         .first()
     )

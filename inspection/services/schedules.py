@@ -54,8 +54,8 @@ def save_schedule(
 ) -> Schedule:
     """Add a schedule, or change ``schedule``. Dates are counted from ``next_due`` whenever the rule changes.
 
-    Raises `BadInput` for an interval below one, or a window that reaches back to the date before: every inspection would
-    then count for two dates.
+    Raises `BadInput` for an interval below one, or a window that reaches back to the date before: every inspection
+    would then count for two dates.
     """
     if unit not in Schedule.Unit.values:
         raise BadInput(f"There is no unit {unit!r}; choose days, weeks or months.")

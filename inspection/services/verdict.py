@@ -64,7 +64,9 @@ def judge(
     ``doubts`` further reasons in sentences why the measurement cannot be trusted.
     """
     limits = list(limit_set.limits.all()) if limit_set is not None else []
-    worst, findings, within = Verdict.OK, [], []
+    worst = Verdict.OK
+    findings: list[str] = []
+    within: list[str] = []
     distrust = list(doubts)
     for limit in limits:
         got = values.get(limit.metric)
@@ -96,11 +98,14 @@ def judge(
     if calibration is None:
         distrust.append("The rig has no calibration, so heights have no vouched-for scale.")
     elif calibration.expired(on):
-        distrust.append(f"The calibration of {calibration.done_on:%Y-%m-%d} expired on {calibration.valid_until:%Y-%m-%d}.")
-    if not undefined_share <= MOST_UNDEFINED_SHARE:  # NaN distrusts too
         distrust.append(
-            f"{100 * undefined_share:.1f} % of the tool was not measured, more than the {100 * MOST_UNDEFINED_SHARE:g} % "
-            f"that a verdict allows."
+            f"The calibration of {calibration.done_on:%Y-%m-%d} expired on {calibration.valid_until:%Y-%m-%d}."
+        )
+    if not undefined_share <= MOST_UNDEFINED_SHARE:  # NaN distrusts too
+        most = 100 * MOST_UNDEFINED_SHARE
+        distrust.append(
+            f"{100 * undefined_share:.1f} % of the tool was not measured, more than the {most:g} % that a "
+            f"verdict allows."
         )
     if partial:
         distrust.append("The scan was ended early, so part of the region was not looked at.")

@@ -88,7 +88,8 @@ class Plant:
         name = queue.replace(".", "-")
         return self.start(
             name, sys.executable, "-m", "celery", "-A", "worker", "worker", "--pool", "prefork", "--concurrency", "1",
-            "--queues", queue, "--hostname", f"{name}@test", "--without-gossip", "--without-mingle", "--loglevel", "INFO",
+            "--queues", queue, "--hostname", f"{name}@test", "--without-gossip", "--without-mingle",
+            "--loglevel", "INFO",
         )  # fmt: skip
 
     def kill(self, name: str) -> None:

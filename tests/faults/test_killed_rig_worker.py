@@ -27,9 +27,7 @@ def site() -> Iterator[Plant]:
 
 
 @pytest.fixture
-def order(
-    site: Plant, make_tool: Callable[..., Tool], rig: Rig, olga: User
-) -> Callable[[], list[Scan]]:
+def order(site: Plant, make_tool: Callable[..., Tool], rig: Rig, olga: User) -> Callable[[], list[Scan]]:
     """Queue two regions, long enough to be killed in."""
     Rig.objects.update(config=site.simulated_rig(speed_up=20.0), exposures_us=[300])
     rig.refresh_from_db()

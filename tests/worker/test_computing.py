@@ -41,7 +41,9 @@ def rung(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
 
 @pytest.fixture
 def calibration(rig: Rig, erik: User) -> Calibration:
-    pairs = "height_mm,column_px\n" + "".join(f"{0.0142 * c:.6f},{c + e}\n" for c, e in ((20, 0), (40, 0.1), (60, -0.1), (90, 0)))
+    pairs = "height_mm,column_px\n" + "".join(
+        f"{0.0142 * c:.6f},{c + e}\n" for c, e in ((20, 0), (40, 0.1), (60, -0.1), (90, 0))
+    )
     today = timezone.localdate()
     return add_calibration(
         rig=rig, csv_file=pairs, by=erik, artefact="Gauge 17", done_on=today, valid_until=today + dt.timedelta(days=90)
@@ -76,7 +78,8 @@ def test_a_scan_ends_done_with_numbers_file_and_verdict(acquired: Scan) -> None:
     assert image.limit_set is not None
     assert image.provenance["stack_sha256"] == scan.stack_sha256
     assert image.precision.sigma_um is not None
-    assert (image.precision.undefined_count, image.precision.cell_row_um) == (0, pytest.approx(7.150838, rel=1e-6))
+    assert image.precision.undefined_count == 0
+    assert image.precision.cell_row_um == pytest.approx(7.150838, rel=1e-6)
     measured = dict(image.measurements.values_list("metric", "value"))
     assert measured["n"] == 0
     assert measured["V-"] == 0
@@ -90,7 +93,7 @@ def test_computing_twice_gives_one_result(acquired: Scan) -> None:
     compute.measure(acquired.pk)
 
     assert RangeImage.objects.count() == 1
-    assert len([path for path in settings.RANGES.rglob("*.npz")]) == 1
+    assert len(list(settings.RANGES.rglob("*.npz"))) == 1
 
 
 def test_a_result_beaten_by_another_process_leaves_no_file(acquired: Scan, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -232,9 +235,7 @@ def test_the_tick_rings_rigs_with_waiting_scans_only(
     assert rung == []
 
 
-def test_the_last_region_moves_the_schedules_date(
-    acquired: Scan, rig: Rig, erik: User
-) -> None:
+def test_the_last_region_moves_the_schedules_date(acquired: Scan, rig: Rig, erik: User) -> None:
     today = timezone.localdate()
     schedule = schedules.save_schedule(
         by=erik, tool=acquired.region.tool, rig=rig, every=1, unit="weeks", next_due=today, automatic=False

@@ -8,14 +8,13 @@ from collections.abc import Callable
 from uuid import uuid4
 
 import pytest
-from django.db import OperationalError, connection
+from django.db import OperationalError, connection, transaction
 from django.utils import timezone
 
 from inspection.models import Rig, Scan, Tool, User
 from inspection.services import queue
 from inspection.services.moves import move
 from inspection.states import QueueState, ScanState
-from worker import lease as leases
 from worker.lease import LEASE_S, Lease, LeaseLostError, claim, claim_computing, sweep
 
 
@@ -173,14 +172,14 @@ def test_a_worker_that_renews_while_it_is_swept_keeps_its_scan(
 ) -> None:
     """The sweep has read the old end of the lease; before it writes, the worker's beat comes through."""
     lease = held(three[0])
-    looked = leases.transaction.atomic
+    looked = transaction.atomic
 
     def beat_first() -> object:
-        monkeypatch.setattr(leases.transaction, "atomic", looked)
+        monkeypatch.setattr(transaction, "atomic", looked)
         lease.renew()
         return looked()
 
-    monkeypatch.setattr(leases.transaction, "atomic", beat_first)
+    monkeypatch.setattr(transaction, "atomic", beat_first)
     assert sweep(timezone.now() + dt.timedelta(seconds=LEASE_S + 1)) == []
 
     rig.refresh_from_db()

@@ -6,7 +6,6 @@ import io
 import json
 import stat
 import zipfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +30,8 @@ DESCRIPTION = {
 
 
 @pytest.fixture(autouse=True)
-def own_folders(settings: Any, tmp_path: Path) -> Iterator[None]:
+def own_folders(settings: Any, tmp_path: Path) -> None:
     settings.STACKS, settings.RANGES, settings.UPLOADS = (tmp_path / name for name in ("stacks", "ranges", "uploads"))
-    yield
 
 
 def stack_files(steps: int = 10, **described: Any) -> dict[str, bytes]:
@@ -65,7 +63,9 @@ def zipped(files: dict[str, bytes], *, inside: str = "", method: int = zipfile.Z
 
 def nothing_stored() -> bool:
     stored = [path for path in settings.STACKS.rglob("*") if path.is_file()] if settings.STACKS.exists() else []
-    return not stored and not Scan.objects.exists() and not Inspection.objects.exists() and not AuditEvent.objects.exists()
+    return (
+        not stored and not Scan.objects.exists() and not Inspection.objects.exists() and not AuditEvent.objects.exists()
+    )
 
 
 def no_upload_left() -> bool:
@@ -227,7 +227,7 @@ def test_an_archive_that_lies_about_its_sizes_is_stopped_while_unpacking(setting
 
 def test_two_files_of_one_name_are_refused() -> None:
     same = [SimpleUploadedFile("a/frame.png", b"1"), SimpleUploadedFile("b/frame.png", b"2")]
-    with pytest.raises(BadInput, match="called frame.png"):
+    with pytest.raises(BadInput, match=r"called frame\.png"):
         importing.unpack_upload(same)
 
     assert no_upload_left()

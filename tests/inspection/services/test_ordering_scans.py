@@ -34,9 +34,7 @@ def names(rig: Rig) -> list[str]:
     return [scan.region.name for scan in rig.scans.filter(state=ScanState.QUEUED).order_by("position", "pk")]
 
 
-def test_one_scan_per_active_region_with_everything_frozen(
-    three: list[Scan], rig: Rig, tool: Tool, erik: User
-) -> None:
+def test_one_scan_per_active_region_with_everything_frozen(three: list[Scan], rig: Rig, tool: Tool, erik: User) -> None:
     region = three[0].region
     update_region(region, by=erik, start_mm=55.0)
     three[0].refresh_from_db()

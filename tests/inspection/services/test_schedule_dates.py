@@ -116,8 +116,7 @@ def test_two_ticks_queue_once(weekly: Schedule) -> None:
 def test_a_tick_beaten_to_the_slot_leaves_nothing_behind(weekly: Schedule, monkeypatch: pytest.MonkeyPatch) -> None:
     """The other tick commits its slot after we looked: our inspection must go with our slot."""
     from inspection.models import DueSlot
-
-    looked = schedules.enqueue_inspection
+    from inspection.services.queue import enqueue_inspection as looked
 
     def other_was_first(**order: object) -> Inspection:
         DueSlot.objects.create(schedule=weekly, due_on=weekly.next_due)

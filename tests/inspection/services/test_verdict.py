@@ -71,9 +71,7 @@ def test_the_verdict_table(
 
 
 def test_a_large_uncertainty_turns_ok_into_watch(limits: LimitSet, calibration: Calibration) -> None:
-    got = judge(
-        values(40.0, u=60.0), undefined_share=0.0, limit_set=limits, calibration=calibration, on=TODAY
-    )
+    got = judge(values(40.0, u=60.0), undefined_share=0.0, limit_set=limits, calibration=calibration, on=TODAY)
 
     assert got.verdict == Verdict.WATCH
     assert "upper 95 % bound of 160" in got.reasons[0]
@@ -91,9 +89,7 @@ def test_an_expired_calibration_makes_ok_unknown_but_keeps_replace(limits: Limit
 
 
 def test_the_last_day_of_a_calibration_still_counts(limits: LimitSet, calibration: Calibration) -> None:
-    got = judge(
-        values(10.0), undefined_share=0.0, limit_set=limits, calibration=calibration, on=dt.date(2026, 12, 31)
-    )
+    got = judge(values(10.0), undefined_share=0.0, limit_set=limits, calibration=calibration, on=dt.date(2026, 12, 31))
 
     assert got.verdict == Verdict.OK
 
