@@ -14,7 +14,7 @@ from __future__ import annotations
 import inspect
 import logging
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -115,18 +115,19 @@ def open_rig(config: Config) -> Iterator[Rig]:
     Raises `RigFault` with one sentence when a part cannot be opened. What was opened before it is closed again.
     """
     rig = build_rig(config)
-    try:
+
+    def attempt(what: str, do: Callable[[], None]) -> None:
+        try:
+            do()
+        except Exception:  # the fault that brought us here is the one to show
+            log.exception("%s of %s failed while leaving the rig", what, rig.name)
+
+    # An ExitStack goes on with its next callback even when a signal interrupts one of them.
+    with ExitStack() as leaving:
+        leaving.callback(attempt, "closing the camera", rig.camera.close)
+        # Also resets the controller, which darkens the laser even if `off` failed.
+        leaving.callback(attempt, "closing the stage", rig.stage.close)
+        leaving.callback(attempt, "switching off the laser", rig.laser.off)
         rig.camera.open()
         rig.stage.open()
         yield rig
-    finally:
-        # `close` of the stage also resets the controller, which darkens the laser even if `off` failed.
-        for what, do in (
-            ("laser off", rig.laser.off),
-            ("stage close", rig.stage.close),
-            ("camera close", rig.camera.close),
-        ):
-            try:
-                do()
-            except Exception:  # each must be tried; the fault that brought us here is the one to show
-                log.exception("%s of %s failed while leaving the rig", what, rig.name)

@@ -138,6 +138,24 @@ def test_pause_on_real_hardware_rehomes_and_goes_on_exactly(bench: Bench) -> Non
     assert kept.steps == expected(range(12))
 
 
+def test_a_stage_without_home_switch_pauses_and_goes_on_too(make_bench: Callable[..., Bench]) -> None:
+    bench = make_bench(settings={20: 0.0, 21: 0.0, 22: 0.0})
+    kept, zero = Kept(), round(bench.state()["position_um"] / 0.49)
+
+    class PauseOnce:
+        readings = 0
+
+        def read(self) -> Order:
+            self.readings += 1
+            return "pause" if self.readings == 6 else "run"
+
+    here = config(bench)
+    here["stage"]["zero"] = "here"
+    with open_rig(here) as rig:
+        assert acquire(rig, PLAN, on_frames=kept, control=PauseOnce()).pauses == 1
+    assert kept.steps == {k: [(zero + p, on, e) for p, on, e in bracket] for k, bracket in expected(range(12)).items()}
+
+
 def test_cancel_and_emergency_stop(bench: Bench) -> None:
     with open_rig(config(bench)) as rig:
         with pytest.raises(Stopped):
