@@ -472,7 +472,7 @@ def _interpolated(
     far = where & ~near
     inside = depth[mask & np.isfinite(depth)]
     if far.any():
-        total += np.count_nonzero(far) * (float(np.median(inside)) if inside.size else 0.0)
+        total += int(np.count_nonzero(far)) * (float(np.median(inside)) if inside.size else 0.0)
     big = np.float32(1e9)
     highest = cv2.dilate(np.where(valid, lost, -big), EIGHT)
     lowest = cv2.erode(np.where(valid, lost, big), EIGHT)

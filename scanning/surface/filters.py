@@ -144,7 +144,7 @@ def wild_pixels(
                 other = padded[rows + 1 + step_row, profiles + 1 + step_profile]
                 agreeing += np.abs(other - own) <= tolerance
     lonely = np.zeros_like(candidate)
-    lonely[rows[agreeing <= 2], profiles[agreeing <= 2]] = True
+    lonely[rows[agreeing == 2], profiles[agreeing == 2]] = True
     wild = np.zeros_like(candidate)
     wild[rows[agreeing < 2], profiles[agreeing < 2]] = True
     labels, _ = label(lonely)

@@ -242,8 +242,9 @@ def _without_wild(residual: Float32, row_pitch: float, profile_pitch: float, war
     if not count:
         return residual
     if warnings is not None:
+        share = 100.0 * count / int(np.count_nonzero(valid))
         warnings.append(
-            f"{count} isolated wild pixels ({100 * count / max(int(np.count_nonzero(valid)), 1):.2f} % of the measured) "
+            f"{count} isolated wild pixels ({share:.2f} % of the measured) "
             "were set aside: wrong peaks smaller than the laser line can resolve."
         )
     return np.where(wild, np.float32(np.nan), residual).astype(np.float32)
