@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from scanning.errors import BadInput, Fault
 from scanning.rig.protocols import Image, SensorMode
-from scanning.rig.simulated.camera_wire import Header, WireClosed, receive_message, send_message
+from scanning.rig.simulated.camera_wire import Header, WireClosed, receive_message, send_message, socket_path
 from scanning.rig.simulated.controller import Controller
 from scanning.rig.simulated.wire import MachineClock, Wire
 
@@ -146,11 +146,12 @@ class Bench:
         path.unlink(missing_ok=True)
         server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
-            server.bind(str(path))
+            with socket_path(path) as name:
+                server.bind(name)
         except OSError as fault:
             server.close()
             raise BadInput(
-                f"The camera's socket {path} cannot be made ({fault}); use a directory with a path under 90 characters."
+                f"The camera's socket {path} cannot be made ({fault}); choose another directory for the simulated rig."
             ) from fault
         server.listen()
         self._server = server

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import socket
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from scanning.errors import CameraFault
 from scanning.rig.protocols import Frame, Image, SensorMode
-from scanning.rig.simulated.camera_wire import Header, WireClosed, receive_message, send_message
+from scanning.rig.simulated.camera_wire import Header, WireClosed, receive_message, send_message, socket_path
 
 #: Longest wait for an answer that needs no light, in seconds. The first scene compiles its kernels: give it a minute.
 ANSWER_S = 60.0
@@ -37,7 +38,8 @@ class SimulatedCamera:
         link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             link.settimeout(5.0)
-            link.connect(self.address)
+            with socket_path(Path(self.address)) as name:
+                link.connect(name)
         except OSError as fault:
             link.close()
             raise CameraFault(

@@ -7,9 +7,13 @@ ends share this file so that neither can drift from the other.
 from __future__ import annotations
 
 import json
+import os
 import socket
 import struct
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 Header = dict[str, Any]
@@ -20,6 +24,23 @@ MAX_HEADER_BYTES = 65_536
 
 class WireClosed(Exception):
     """The other end hung up, or what came was no message."""
+
+
+#: Longest socket path handed to the kernel as it is; it takes 107 bytes.
+MAX_PATH_BYTES = 100
+
+
+@contextmanager
+def socket_path(path: Path) -> Iterator[str]:
+    """A name for ``path`` that a unix socket accepts, however deep the directory lies (on Linux)."""
+    if len(os.fsencode(path)) <= MAX_PATH_BYTES:
+        yield str(path)
+        return
+    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        yield f"/proc/self/fd/{folder}/{path.name}"
+    finally:
+        os.close(folder)
 
 
 def send_message(link: socket.socket, header: Header, payload: bytes | memoryview = b"") -> None:

@@ -16,6 +16,7 @@ from scanning.errors import CameraFault
 from scanning.rig.protocols import Frame, SensorMode
 from scanning.rig.rig import open_rig
 from scanning.rig.session import Order, ScanPlan, acquire
+from scanning.rig.simulated.bench import Bench
 from scanning.rig.simulated.camera import SimulatedCamera
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -73,3 +74,13 @@ def test_a_wrong_speed_is_one_sentence(folder: Path) -> None:
     _, trouble = process.communicate(timeout=20)
     assert process.returncode == 1
     assert trouble.strip() == "The speed-up is 0.0; it must be above 0."
+
+
+def test_a_directory_too_deep_for_a_socket_works_all_the_same(folder: Path) -> None:
+    """The kernel takes socket paths of 107 bytes; a clone may lie anywhere."""
+    deep = folder / ("deep" * 20) / ("er" * 30)
+    with Bench(deep, speed_up=1000.0) as bench:
+        camera = SimulatedCamera(bench.camera_address)
+        assert camera.bench_state()["laser"] == 0.0
+        camera.close()
+    assert not list(deep.iterdir())
