@@ -171,6 +171,15 @@ class ProfileStream:
         self._saturated = self._pixels = 0
         return [profile]
 
+    def candidates(self) -> tuple[Float64, Float64]:
+        """The peaks of the last profile as (row, column px) pairs: those taken as the line, and those rejected.
+
+        For pictures and for a person who wonders why the line went where it went.
+        """
+        if self._chain is None:
+            return np.empty((0, 2)), np.empty((0, 2))
+        return self._chain.candidates()
+
     # -- what the header did not say ------------------------------------------------------------------------------
 
     def _measures_width(self) -> bool:
@@ -228,7 +237,9 @@ class ProfileStream:
             k=k,
             floor=floor,
             snr=line.snr if line.snr is not None else (COMPRESSED_SNR if compressed else RAW_SNR),
-            grain_px=line.grain_px if line.grain_px is not None else max(GRAIN_PX, (expected or 0.0) / 4.0),
+            grain_px=line.grain_px
+            if line.grain_px is not None
+            else max(GRAIN_PX, (line.width_px or width or 0.0) / 4.0),
             estimated=tuple(estimated),
         )
         self._chain = _Chain(self.recipe, h, self.settled, selected)
@@ -329,10 +340,10 @@ class _Chain:
             line.gate_px, line.gate_max_px, line.seed == "best",
         )  # fmt: skip
         most = columns // 2 + 1
-        self._scratch = (
+        self._scratch = (  # light, base, shape, height, counts, chosen
             np.empty(rows, np.int64),
             np.empty((rows, most, 2), np.int64), np.empty((rows, most, 2)), np.empty((rows, most), np.int64),
-            np.empty(rows, np.int64), np.empty(rows, np.int64),
+            np.zeros(rows, np.int64), np.empty(rows, np.int64),
         )  # fmt: skip
         self._rows = rows
 
@@ -364,6 +375,13 @@ class _Chain:
             image, self._top, self._scale, self._dark, *self._line, highest, *self._scratch, column_px, peak, width_px
         )
         return column_px, (peak / self._grey_level).astype(np.float32), width_px.astype(np.float32)
+
+    def candidates(self) -> tuple[Float64, Float64]:
+        _, _, shape, _, counts, chosen = self._scratch
+        pairs = [(r, float(shape[r, k, 0]), k == chosen[r]) for r in range(self._rows) for k in range(counts[r])]
+        taken = np.array([(r, c) for r, c, is_line in pairs if is_line], dtype=np.float64).reshape(-1, 2)
+        rejected = np.array([(r, c) for r, c, is_line in pairs if not is_line], dtype=np.float64).reshape(-1, 2)
+        return taken, rejected
 
     def _apply_tables(self, images: list[Image]) -> None:
         assert self._tables is not None

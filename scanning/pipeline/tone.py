@@ -59,4 +59,4 @@ def light_share(share: float, p: float) -> float:
     0.1 % of the light, deep in the noise on both sides of the line, and the centroid would follow the noise.
     """
     peak = (GREY_TOP + 1.0) / 4.0
-    return (math.log(share * peak + 1.0) / math.log(peak + 1.0)) ** p
+    return math.pow(math.log(share * peak + 1.0) / math.log(peak + 1.0), p)

@@ -77,7 +77,9 @@ def reference(steps: Steps, header: StackHeader, recipe: Recipe) -> NDArray[np.f
         floor_from_row_mean=line.floor_from == "row_mean",
         ceiling=line.ceiling,
         snr=line.snr if line.snr is not None else (3.0 if compressed else 4.0),
-        grain=line.grain_px if line.grain_px is not None else max(3.0, (width or 0.0) / 4),
+        grain=line.grain_px
+        if line.grain_px is not None
+        else max(3.0, (line.width_px or header.line_width_px or 0.0) / 4),
         width=width,
         width_factor=line.width_factor,
         gate=line.gate_px,

@@ -21,6 +21,7 @@ def metal_line() -> dict[str, NDArray[np.uint8]]:
     frames = {}
     for file in files:
         image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-        assert image is not None and image.dtype == np.uint8
+        assert image is not None
+        assert image.dtype == np.uint8
         frames[file.name] = np.asarray(image, dtype=np.uint8)
     return frames

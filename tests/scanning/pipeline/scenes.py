@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+Float = NDArray[Any]
 
 
 def line(centre: Float, columns: int, fwhm_px: float, height: float | Float) -> Float:
     """(rows, columns) light of a Gaussian line at ``centre`` (rows,)."""
     away = np.arange(columns)[None, :] - centre[:, None]
-    return np.atleast_1d(height)[:, None] * np.exp(-4.0 * np.log(2.0) * (away / fwhm_px) ** 2)
+    shape = np.exp(-4.0 * np.log(2.0) * (away / fwhm_px) ** 2)
+    return np.asarray(np.atleast_1d(height)[:, None] * shape)
 
 
 def speckle(light: Float, rng: np.random.Generator, grain_px: float = 1.7) -> Float:
@@ -21,7 +24,7 @@ def speckle(light: Float, rng: np.random.Generator, grain_px: float = 1.7) -> Fl
     pupil = np.sqrt(frequency) <= 0.5 / grain_px
     amplitude = np.fft.ifft2(np.fft.fft2(fields[0] + 1j * fields[1]) * pupil)
     grains = np.abs(amplitude) ** 2
-    return light * grains / grains.mean()
+    return np.asarray(light * grains / grains.mean())
 
 
 def shot(light: Float, rng: np.random.Generator, dark: float = 2.0, noise: float = 1.0) -> NDArray[np.uint8]:

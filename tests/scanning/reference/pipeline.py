@@ -91,11 +91,11 @@ def grey_images(stack: list[list[NDArray[Any]]], s: Setting) -> list[Array]:
                 if tone_first:
                     g = eq_7(g, s.p)
                 singles.append(quantised(g, window))
-            image = sum(singles) / window
+            image = np.sum(singles, axis=0) / window
             if "glt" in s.order and not tone_first:
                 image = quantised(eq_7(image, s.p), 1)
         else:
-            means = [sum(step[e] for step in codes) / window for e in range(len(codes[0]))]
+            means = [np.sum([step[e] for step in codes], axis=0) / window for e in range(len(codes[0]))]
             if "hdre" in s.order:
                 full = [sum((step[e] >= s.saturation).astype(int) for step in codes) for e in range(len(codes[0]))]
                 need = window if s.saturated == "all" else 1
