@@ -9,11 +9,22 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable
 
-from inspection.models import Inspection, Rig, Scan
-from inspection.states import LIVE, ScanState
+from inspection.demo.plant import DemoPlant
+from inspection.models import Inspection, Rig, Scan, User
+from inspection.services.queue import enqueue_inspection, resume_queue
+from inspection.states import LIVE, QueueState, ScanState
 
 #: A demo scan that shows no progress for this long will not come any more.
 STALLED_S = 180.0
+
+
+def order_demo_scan(plant: DemoPlant) -> Inspection:
+    """Queue the demo knife's regions, as its operator would; a queue left paused by an earlier run is resumed."""
+    operator = User.objects.filter(username="olga").first()
+    rig = Rig.objects.get(pk=plant.rig.pk)
+    if rig.queue_state == QueueState.PAUSED:
+        resume_queue(rig, operator)
+    return enqueue_inspection(tool=plant.tool, rig=rig, by=operator, reason="First scan after start-up")
 
 
 def follow(

@@ -103,7 +103,7 @@ class PrecisionReport(InsertOnly):
     sigma_um = models.FloatField(null=True)
     cell_scan_um = models.FloatField()
     cell_row_um = models.FloatField()
-    ns_per_range_pixel = models.FloatField()
+    ns_per_range_pixel = models.FloatField(null=True, help_text="None where nothing was computed from frames.")
     cpu_ns_per_range_pixel = models.FloatField(null=True)
     detail = models.JSONField(default=dict)
 

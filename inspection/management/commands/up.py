@@ -128,7 +128,7 @@ class Command(BaseCommand):
         from scanning.pipeline import warm_up
 
         self.say("Compiling the measuring kernels (once per machine) ...")
-        warm_up(lambda done, total, name: self.say(f"    kernel {done}/{total}: {name}") if sys.stdout.isatty() else None)
+        warm_up(lambda done, total: self.say(f"    {done} of {total}") if sys.stdout.isatty() else None)
 
     def start_services(self, host: str, port: int, rig: str) -> Child:
         python = sys.executable
