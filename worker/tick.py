@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import datetime as dt
 import logging
+from typing import Any
 
+from celery import signals
 from django.db.models import Q
 from django.utils import timezone
 
 from inspection.models import Recomputation, Rig, Scan
 from inspection.services import schedules
-from inspection.services.ring import ring, ring_measure, ring_recompute
+from inspection.services.ring import COMPUTE_QUEUE, ring, ring_measure, ring_recompute
 from inspection.states import QueueState, ScanState
 from worker import lease
-from worker.celery import app
+from worker.celery import TICK_EVERY_S, app
 from worker.compute import RECOMPUTATION_LOST
 
 log = logging.getLogger(__name__)
@@ -37,6 +39,12 @@ def tick() -> None:
     for schedule, why in summary.refused:
         log.warning("%s could not be queued: %s", schedule, why)
     ring_what_waits(now)
+
+
+@signals.beat_init.connect
+def tick_at_once(**_: Any) -> None:
+    """Tick when the clock starts, not a minute later: what fell due while nothing ran is queued first."""
+    tick.apply_async(queue=COMPUTE_QUEUE, expires=TICK_EVERY_S)
 
 
 @app.task(name="worker.sweep", ignore_result=True)

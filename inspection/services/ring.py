@@ -50,7 +50,8 @@ def _sender() -> Celery:
     """Return a Celery client that only sends. `inspection` never imports the worker's code."""
     app = Celery("doorbell", broker=settings.REDIS_URL, set_as_current=False)
     app.conf.update(
-        broker_transport_options=broker_options(settings.REDIS_URL),
+        # One try: kombu's patience of several seconds would be spent by the person who pressed the button.
+        broker_transport_options={**broker_options(settings.REDIS_URL), "max_retries": 1, "interval_start": 0.0},
         broker_connection_retry=False,
         task_ignore_result=True,
         task_publish_retry=False,

@@ -29,6 +29,12 @@ MOST_UNDEFINED_SHARE = 0.05
 #: Coverage factor of the bound that is held against the replace limit (about 95 %).
 COVERAGE_K = 2.0
 
+#: Why a metric can be missing, where there is a likelier reason than "it was not measured".
+NOT_MEASURED = dict.fromkeys(
+    ("ER_max", "ER_mean", "ER_p95", "ER_rms", "EL"),
+    "No cutting edge was found in the range image, so its recession could not be held against its limit.",
+)
+
 
 @dataclass(frozen=True)
 class Value:
@@ -71,7 +77,7 @@ def judge(
     for limit in limits:
         got = values.get(limit.metric)
         if got is None or got.value is None or not math.isfinite(got.value):
-            distrust.append(f"{limit.metric} has a limit but was not measured.")
+            distrust.append(NOT_MEASURED.get(limit.metric, f"{limit.metric} has a limit but was not measured."))
             continue
         name = got.label or limit.metric
         shown = f"{name} is {_figure(got.value)} {limit.unit}"
