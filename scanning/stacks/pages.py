@@ -21,6 +21,7 @@ import tifffile
 
 from scanning.errors import BadInput
 from scanning.rig.protocols import Image
+from scanning.stacks.reason import reason
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
 PNG_END = b"IEND\xaeB`\x82"
@@ -170,11 +171,11 @@ class TiffPages:
     def _decoded(self, index: int) -> Image:
         what = f"{self.path}, page {index + 1}"
         if not self._by_opencv:
-            if self._tiff is None:
-                self._tiff = tifffile.TiffFile(self.path)
-            page: Any = self._tiff.pages[index]
             try:
                 with _quiet():
+                    if self._tiff is None:
+                        self._tiff = tifffile.TiffFile(self.path)
+                    page: Any = self._tiff.pages[index]
                     return grey(np.asarray(page.asarray()), what)
             except ValueError as error:
                 # LZW and other codecs live in tifffile's optional imagecodecs; OpenCV carries its own libtiff.
@@ -207,7 +208,7 @@ class TiffPages:
         except Exception as error:
             part = "" if index is None else f", page {index + 1},"
             raise BadInput(
-                f"{self.path}{part} is not a readable TIFF or is damaged ({error}); copy it again"
+                f"{self.path}{part} is not a readable TIFF or is damaged ({reason(error)}); copy it again"
             ) from error
 
 

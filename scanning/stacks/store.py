@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import json
 import os
-import struct
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -29,6 +28,8 @@ from scanning.frames import Stack, StackHeader
 from scanning.rig.protocols import Image
 from scanning.stacks.description import header_from_json, header_to_json
 from scanning.stacks.identity import Identity, stack_sha256
+from scanning.stacks.reason import reason
+from scanning.stacks.superblock import open_hdf5
 
 STORE_FORMAT = "edgewatch-frames/1"
 PART_SUFFIX = ".part"
@@ -61,7 +62,7 @@ class StackWriter:
             self._file: h5py.File | None = h5py.File(self.part, "w", libver=("v110", "v110"))
         except OSError as error:
             raise BadInput(
-                f"{self.part} cannot be written ({error}); check the folder, its rights and the disk"
+                f"{self.part} cannot be written ({reason(error)}); check the folder, its rights and the disk"
             ) from error
         self._file.attrs["format"] = STORE_FORMAT
         self._file.attrs["header"] = json.dumps(header_to_json(header), sort_keys=True, allow_nan=False)
@@ -110,7 +111,7 @@ class StackWriter:
             self._crc32[step] = [_crc32(image) for image in images]
             self._crc32.flush()
         except (OSError, RuntimeError) as error:
-            raise BadInput(f"{self.part} cannot be written ({error}); make room on the disk") from error
+            raise BadInput(f"{self.part} cannot be written ({reason(error)}); make room on the disk") from error
         self._identity.add(images)
         self.steps_written = step + 1
 
@@ -135,7 +136,7 @@ class StackWriter:
                 os.close(descriptor)
             os.replace(self.part, self.path)
         except (OSError, RuntimeError) as error:
-            raise BadInput(f"{self.part} cannot be finished ({error}); make room on the disk") from error
+            raise BadInput(f"{self.part} cannot be finished ({reason(error)}); make room on the disk") from error
         return done
 
     def close(self) -> None:
@@ -179,14 +180,16 @@ class StoredStack:
     def open(cls, path: Path) -> StoredStack:
         """Open a finished file, a part left by a dead writer, or one that is being written now."""
         try:
-            file = _open_file(path)
+            file = open_hdf5(path)
         except OSError as error:
-            raise BadInput(f"{path} is damaged and cannot be opened ({error}); use a copy of it") from error
+            raise BadInput(f"{path} is damaged and cannot be opened ({reason(error)}); use a copy of it") from error
         try:
             return cls._checked(path, file)
         except (KeyError, ValueError, TypeError, OSError, RuntimeError) as error:
             file.close()
-            raise BadInput(f"{path} is damaged: its index cannot be read ({error}); use a copy of it") from error
+            raise BadInput(
+                f"{path} is damaged: its index cannot be read ({reason(error)}); use a copy of it"
+            ) from error
         except BadInput:
             file.close()
             raise
@@ -226,7 +229,7 @@ class StoredStack:
         try:
             images = [np.asarray(image) for image in self._frames[index]]
         except (OSError, RuntimeError) as error:
-            raise BadInput(f"{self.path} is damaged at step {index} ({error}); use a copy of it") from error
+            raise BadInput(f"{self.path} is damaged at step {index} ({reason(error)}); use a copy of it") from error
         for place, image in enumerate(images):
             if _crc32(image) != int(self._crc32[index, place]):
                 raise BadInput(f"{self.path} is damaged at step {index}: a frame fails its checksum; use a copy of it")
@@ -278,24 +281,6 @@ def save_stack(
     except BaseException:
         writer.discard()
         raise
-
-
-def _open_file(path: Path) -> h5py.File:
-    """Open plainly, or, when the file says that a writer is at work or died, in the single-writer mode.
-
-    The library itself must not be asked: a single-writer reader never returns from a file whose end is missing. So
-    flags and length are read from the head (superblock version 3: flags at 11, end of file at 28, little endian).
-    """
-    with path.open("rb") as file:
-        head = file.read(36)
-    if len(head) < 36 or head[8] != 3:
-        return h5py.File(path, "r")
-    (end,) = struct.unpack("<Q", head[28:36])
-    size = path.stat().st_size
-    if size < end:
-        raise OSError(f"it is cut off: {size} of {end} bytes")
-    being_written = bool(head[11])
-    return h5py.File(path, "r", libver="latest", swmr=True) if being_written else h5py.File(path, "r")
 
 
 def _whole_steps(frames: Any, crc32: Any, steps: int) -> int:
