@@ -30,8 +30,8 @@ api = NinjaAPI(
     version="1.0.0",
     description=(
         "Tools, scans, numbers with their uncertainties, queues and due dates. Lengths, volumes and times carry their "
-        "unit in the name; null means not measured; u is a standard uncertainty (k = 1). Faults come as one sentence in "
-        "`detail`; an order that does not fit the present state is answered with 409 and that state."
+        "unit in the name; null means not measured; u is a standard uncertainty (k = 1). Faults come as one sentence "
+        "in `detail`; an order that does not fit the present state is answered with 409 and that state."
     ),
     urls_namespace="api",
     auth=[TokenKey(), SessionKey()],

@@ -82,8 +82,8 @@ def answer_faults(api: NinjaAPI) -> None:
 
     @api.exception_handler(Http404)
     def missing(request: HttpRequest, error: Http404) -> HttpResponse:
-        words = str(error)
-        return said(request, 404, words if words.endswith(".") and " matches " not in words else "There is no such record.")
+        ours = str(error).endswith(".") and " matches " not in str(error)
+        return said(request, 404, str(error) if ours else "There is no such record.")
 
     @api.exception_handler(PermissionDenied)
     def denied(request: HttpRequest, error: PermissionDenied) -> HttpResponse:

@@ -18,7 +18,11 @@ from inspection.services.recipes import recipe_named
 from scanning.errors import BadInput
 
 
-@router.post("/inspections", tags=["ordering"], response={201: shapes.Inspection, 409: shapes.Conflict, 400: shapes.Fault, **FAULTS})
+@router.post(
+    "/inspections",
+    tags=["ordering"],
+    response={201: shapes.Inspection, 400: shapes.Fault, 409: shapes.Conflict, **FAULTS},
+)
 def order_inspection(request: HttpRequest, order: shapes.Order) -> Any:
     """Queue one scan per region of a tool at a rig. All are queued, or none."""
     by = caller(request, Role.OPERATOR)

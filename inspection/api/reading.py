@@ -17,7 +17,7 @@ from inspection.api.shapes import Id, Word
 from inspection.models import Inspection, RangeImage, Rig, Role, Scan, Tool
 from inspection.reports.csv import Dialect, write_range_image
 from inspection.reports.pdf import inspection_pdf
-from inspection.reports.rows import Selection, latest_verdicts, verdict_of_visit
+from inspection.reports.rows import Cell, Selection, latest_verdicts, verdict_of_visit
 from inspection.reports.stored import load, path_of
 from inspection.reports.views import file_name, newest_result, scan_name, streamed
 from inspection.selectors.due import due_list
@@ -118,7 +118,8 @@ def report(request: HttpRequest, inspection_id: Key) -> HttpResponseBase:
     caller(request)
     found = _one(Inspection.objects.select_related("tool__tool_type", "requested_by"), inspection_id, "inspection")
     answer = HttpResponse(inspection_pdf(found), content_type="application/pdf")
-    answer["Content-Disposition"] = f'attachment; filename="{file_name(f"{found.tool.code}_inspection-{found.pk}")}.pdf"'
+    name = file_name(f"{found.tool.code}_inspection-{found.pk}")
+    answer["Content-Disposition"] = f'attachment; filename="{name}.pdf"'
     return answer
 
 
@@ -185,7 +186,11 @@ def range_csv(request: HttpRequest, scan_id: Key, sep: Word = ",", decimal: Word
     found = _scan_for_download(scan_id)
     dialect = Dialect.asked_for(sep, decimal)
     stored = newest_result(found)
-    about = [("tool", found.inspection.tool.code), ("region", found.region.name), ("scan", found.pk)]
+    about: list[tuple[str, Cell]] = [
+        ("tool", found.inspection.tool.code),
+        ("region", found.region.name),
+        ("scan", found.pk),
+    ]
     return streamed(write_range_image(load(stored), about, dialect), f"{scan_name(found)}_range")
 
 
@@ -301,7 +306,8 @@ def scan_row(row: Any) -> dict[str, Any]:
         **{
             name: getattr(row, name)
             for name in (
-                "state", "source", "partial", "phase", "done", "total", "queued_at", "started_at", "finished_at", "fault",
+                "state", "source", "partial", "phase", "done", "total", "queued_at", "started_at", "finished_at",
+                "fault",
             )
         },
     }  # fmt: skip
@@ -368,4 +374,3 @@ def _queue_row(row: QueueRow) -> dict[str, Any]:
         "starts_at": row.starts_at,
         "ends_at": row.ends_at,
     }
-

@@ -1,6 +1,7 @@
 """The shapes of what the API takes and gives. They are the contract: the OpenAPI document is made of them.
 
-Lengths, volumes and times carry their unit in the name; null means not measured. ``u`` is a standard uncertainty (k = 1).
+Lengths, volumes and times carry their unit in the name; null means not measured. ``u`` is a standard uncertainty
+(k = 1).
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ class Tool(Schema):
     status: str
     life_used: float
     life_unit: str
-    verdict: str | None = Field(description="Worst verdict over the newest result of every region; null if never measured.")
+    verdict: str | None = Field(description="Worst over the newest result of every region; null if never measured.")
     last_inspected: dt.datetime | None
 
 
@@ -193,7 +194,9 @@ class Order(Schema):
     tool: Word = Field(description="The tool's code, as on its label.")
     rig: Word = Field(description="The rig's slug.")
     regions: list[Word] | None = Field(None, max_length=200, description="Names; left out: all active regions.")
-    recipe: Word | None = Field(None, description="NF, SCI, HDRE-I, HDRE-II or HDR-CAM; left out: what fits the exposures.")
+    recipe: Word | None = Field(
+        None, description="NF, SCI, HDRE-I, HDRE-II, HDR-CAM; left out: what fits the exposures."
+    )
     exposures_us: list[float] | None = Field(None, max_length=32, description="Left out: the rig's bracket.")
     reason: Word = ""
 

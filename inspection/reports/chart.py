@@ -16,7 +16,9 @@ from inspection.reports.svg import FAINT, INK, Drawing, tick_text, ticks
 from inspection.units import unit_sign
 
 #: Okabe-Ito colours, told apart by colour-blind readers; the marks differ too.
-SERIES = [("#0072b2", "circle"), ("#d55e00", "square"), ("#009e73", "triangle"), ("#cc79a7", "circle"), ("#56b4e9", "square")]
+SERIES = [
+    ("#0072b2", "circle"), ("#d55e00", "square"), ("#009e73", "triangle"), ("#cc79a7", "circle"), ("#56b4e9", "square"),
+]  # fmt: skip
 WATCH, REPLACE = "#b07d00", "#c1121f"
 #: More marks than this would hide the curve (grafana#27474); the latest are drawn.
 MOST_EVENTS = 8
@@ -46,10 +48,10 @@ def draw_trend(trends: Sequence[dict[str, Any]], width: float = 84.0, height: fl
     paper = Drawing(width, height)
 
     def x(t: dt.datetime) -> float:
-        return left + (t - begin).total_seconds() / (end - begin).total_seconds() * w
+        return left + (t - begin) / (end - begin) * w
 
     def y(value: float) -> float:
-        return top + (high - min(max(value, low), high)) / (high - low) * h
+        return float(top + (high - min(max(value, low), high)) / (high - low) * h)
 
     for value in ticks(low, high, 5):
         paper.line(left, y(value), left + w, y(value), "#e4e8eb", 0.15)
@@ -68,9 +70,8 @@ def draw_trend(trends: Sequence[dict[str, Any]], width: float = 84.0, height: fl
         line = [(moment(p["t"]), p) for p in (trend["fit"] or {}).get("line", []) if p["t"]]
         line = [(t, p) for t, p in line if t <= end]
         band = [(t, p) for t, p in line if p["low"] is not None]
-        paper.path(
-            [(x(t), y(p["high"])) for t, p in band] + [(x(t), y(p["low"])) for t, p in reversed(band)], colour, 0, colour
-        )
+        outline = [(x(t), y(p["high"])) for t, p in band] + [(x(t), y(p["low"])) for t, p in reversed(band)]
+        paper.path(outline, colour, 0, colour)
         paper.path([(x(t), y(p["value"])) for t, p in line if low <= p["value"] <= high], colour, 0.25)
         for p in trend["points"]:
             if p["value"] is not None:

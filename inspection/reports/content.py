@@ -40,7 +40,9 @@ MOST_DAMAGES = 25
 def inspection_content(inspection: Inspection) -> tuple[Json, dt.datetime]:
     """Return the report's data, JSON-ready, and the moment its newest record was made (the document's date)."""
     tool = inspection.tool
-    scans = list(inspection.scans.select_related("region", "rig", "recipe", "calibration").order_by("region__name", "pk"))
+    scans = list(
+        inspection.scans.select_related("region", "rig", "recipe", "calibration").order_by("region__name", "pk")
+    )
     results = {scan.pk: _newest(scan) for scan in scans}
     found = [result for result in results.values() if result is not None]
     moments = [result.created_at for result in found] + [scan.finished_at for scan in scans if scan.finished_at]
@@ -63,7 +65,10 @@ def inspection_content(inspection: Inspection) -> tuple[Json, dt.datetime]:
             ["Ordered", f"{_moment(inspection.requested_at)} by {_person(inspection.requested_by)}"],
             ["Reason", inspection.reason or "not stated"],
             ["Rig", ", ".join(sorted({scan.rig.name for scan in scans})) or "none"],
-            ["Finished", _moment(max(ended)) if (ended := [s.finished_at for s in scans if s.finished_at]) else "not yet"],
+            [
+                "Finished",
+                _moment(max(ended)) if (ended := [s.finished_at for s in scans if s.finished_at]) else "not yet",
+            ],
         ],
         "note": tool.note.strip(),
         "regions": [_region(scan, results[scan.pk]) for scan in scans],
@@ -160,11 +165,12 @@ def _precision(result: RangeImage) -> list[list[str]]:
         return [["Precision report", "none stored"]]
     cell = f"{precision.cell_row_um:.2f} × {precision.cell_scan_um:.2f} µm"
     sigma = "not measured" if precision.sigma_um is None else f"{precision.sigma_um:.2f} µm in a cell of {cell}"
+    pitches = f"{result.row_pitch_um:.3f} × {result.profile_pitch_um:.2f} µm"
     return [
         ["Undefined", f"{100 * precision.undefined_share:.2f} % ({precision.undefined_count})"],
         ["Saturated", f"{100 * precision.saturated_share:.4f} % ({precision.saturated_count})"],
         ["Noise σ, flat part", sigma],
-        ["Range image", f"{result.rows} × {result.profiles}, {result.row_pitch_um:.3f} × {result.profile_pitch_um:.2f} µm"],
+        ["Range image", f"{result.rows} × {result.profiles}, {pitches}"],
         [
             "Processing",
             "not timed"
@@ -177,18 +183,20 @@ def _precision(result: RangeImage) -> list[list[str]]:
 def _charts(inspection: Inspection, limit_sets: Sequence[LimitSet], as_of: dt.datetime) -> list[Json]:
     """One chart for each limited metric, all regions of the tool together, with what is to be expected."""
     codes = [limit.metric for limit_set in limit_sets[:1] for limit in limit_set.limits.all()][:MOST_CHARTS]
-    trends = tool_trends(inspection.tool, codes, until=as_of, now=as_of) if codes else []
+    in_force = limit_sets[0] if limit_sets else None
+    trends = tool_trends(inspection.tool, codes, until=as_of, now=as_of, limit_set=in_force) if codes else []
     charts = []
     for code in codes:
         mine = [trend for trend in trends if trend["metric"]["code"] == code]
         if not mine or (svg := draw_trend(mine)) is None:
             continue
         metric = next((trend["metric"] for trend in mine if trend["points"]), mine[0]["metric"])
+        scans = sum(len(trend["points"]) for trend in mine)
         charts.append(
             {
                 "title": metric["label"],
                 "svg": svg,
-                "alt": f"{metric['label']} of {inspection.tool.code} over time, {sum(len(t['points']) for t in mine)} scans.",
+                "alt": f"{metric['label']} of {inspection.tool.code} over time, {scans} scans.",
                 "sentences": [[trend["region"]["name"], trend["sentence"]] for trend in mine if trend["points"]],
             }
         )
@@ -212,15 +220,17 @@ def _limit(limit: Limit, labels: dict[str, str]) -> list[str]:
 
 def _calibration(calibration: Calibration, as_of: dt.datetime) -> list[list[str]]:
     expired = calibration.expired(timezone.localdate(as_of))
+    slope, u_slope = calibration.slope_mm_per_px, calibration.u_slope_mm_per_px
+    spread = (
+        f"standard deviation {calibration.residual_sd_um:.1f} µm, leave-one-out {calibration.leave_one_out_um:.1f} µm"
+    )
     return [
         ["Rig", calibration.rig.name],
         ["Done", f"{_date(calibration.done_on)} by {_person(calibration.by)}"],
         ["Valid until", _date(calibration.valid_until) + (" (EXPIRED when this was judged)" if expired else "")],
         ["Artefact", calibration.artefact],
-        ["Slope", f"{calibration.slope_mm_per_px:.7f} mm/px, standard uncertainty {calibration.u_slope_mm_per_px:.7f} mm/px "
-                  f"({100 * calibration.u_slope_mm_per_px / abs(calibration.slope_mm_per_px):.2f} %)"],
-        ["Residuals", f"largest {calibration.max_residual_um:.1f} µm, standard deviation {calibration.residual_sd_um:.1f} µm, "
-                      f"leave-one-out {calibration.leave_one_out_um:.1f} µm"],
+        ["Slope", f"{slope:.7f} mm/px, standard uncertainty {u_slope:.7f} mm/px ({100 * u_slope / abs(slope):.2f} %)"],
+        ["Residuals", f"largest {calibration.max_residual_um:.1f} µm, {spread}"],
         ["Range", f"{calibration.low_mm:g} to {calibration.high_mm:g} mm"],
     ]  # fmt: skip
 

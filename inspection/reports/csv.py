@@ -87,7 +87,7 @@ def write_table(table: Table, dialect: Dialect) -> Iterator[str]:
 
 
 def write_range_image(image: RangeImage, about: Iterable[tuple[str, Cell]], dialect: Dialect) -> Iterator[str]:
-    """Yield one range image: ``about`` it, then a matrix of heights in um, mm positions on both axes, empty = undefined.
+    """Yield one range image: ``about`` it, then a matrix of heights in um with mm on both axes, empty = undefined.
 
     The scan runs to the right (x), the laser line downwards (y). Heights to 0.01 um, positions to 0.1 um.
     """

@@ -12,6 +12,7 @@ import json
 import logging
 from functools import cache
 from pathlib import Path
+from typing import Any, Literal
 
 import typst
 
@@ -20,7 +21,7 @@ from inspection.reports.content import Json, inspection_content
 
 log = logging.getLogger(__name__)
 #: PDF/A-3a for archives, PDF/UA-1 for screen readers.
-STANDARDS = ["a-3a", "ua-1"]
+STANDARDS: list[Literal["a-3a", "ua-1"]] = ["a-3a", "ua-1"]
 FONT_NOTE = (
     "Some characters of this document are shown as boxes: no font for them is installed on the server that made it."
 )
@@ -48,13 +49,11 @@ def compiled(content: Json, as_of: dt.datetime) -> bytes:
     return _compile({**content, "font_note": FONT_NOTE}, as_of, [])
 
 
-def _compile(content: Json, as_of: dt.datetime, standards: list[str]) -> bytes:
-    return bytes(
-        typst.compile(
-            layout(),
-            format="pdf",
-            sys_inputs={"data": json.dumps(content, allow_nan=False)},
-            pdf_standards=standards,
-            timestamp=int(as_of.timestamp()),
-        )
+def _compile(content: Json, as_of: dt.datetime, standards: list[Any]) -> bytes:
+    return typst.compile(
+        layout(),
+        format="pdf",
+        sys_inputs={"data": json.dumps(content, allow_nan=False)},
+        pdf_standards=standards,
+        timestamp=int(as_of.timestamp()),
     )

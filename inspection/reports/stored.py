@@ -28,7 +28,8 @@ def load(stored: StoredRangeImage) -> RangeImage:
         content = path.read_bytes()
     except OSError:
         raise BadInput(
-            f"The range image file {stored.file} of scan {stored.scan_id} is missing; compute the scan again from its stack."
+            f"The range image file {stored.file} of scan {stored.scan_id} is missing; "
+            "compute the scan again from its stack."
         ) from None
     if hashlib.sha256(content).hexdigest() != stored.sha256:
         raise BadInput(
@@ -43,7 +44,8 @@ def load(stored: StoredRangeImage) -> RangeImage:
                 for name in ("column_px", "intensity", "width_px")
             }
     except (KeyError, ValueError, OSError, zipfile.BadZipFile) as error:
-        raise BadInput(f"The range image file {stored.file} of scan {stored.scan_id} cannot be read: {error}.") from None
+        name = f"The range image file {stored.file} of scan {stored.scan_id}"
+        raise BadInput(f"{name} cannot be read: {error}.") from None
     return RangeImage(
         column_px=channel["column_px"],
         height_um=height,

@@ -34,7 +34,9 @@ class Drawing:
         opacity = ' fill-opacity="0.13"' if fill != "none" else ""
         self.parts.append(f'<path d="{d}" fill="{fill}"{opacity} {stroke}/>')
 
-    def box(self, x: float, y: float, w: float, h: float, colour: str = INK, width: float = 0.2, fill: str = "none") -> None:
+    def box(
+        self, x: float, y: float, w: float, h: float, colour: str = INK, width: float = 0.2, fill: str = "none"
+    ) -> None:
         self.parts.append(
             f'<rect x="{x:.3f}" y="{y:.3f}" width="{w:.3f}" height="{h:.3f}" fill="{fill}" stroke="{colour}" '
             f'stroke-width="{width}"/>'
@@ -49,21 +51,27 @@ class Drawing:
         elif shape == "square":
             self.parts.append(f'<rect x="{x - r:.3f}" y="{y - r:.3f}" width="{2 * r}" height="{2 * r}" {look}/>')
         else:
-            self.parts.append(f'<path d="M{x - r:.3f} {y + r:.3f}L{x + r:.3f} {y + r:.3f}L{x:.3f} {y - r:.3f}Z" {look}/>')
+            corners = f"M{x - r:.3f} {y + r:.3f}L{x + r:.3f} {y + r:.3f}L{x:.3f} {y - r:.3f}Z"
+            self.parts.append(f'<path d="{corners}" {look}/>')
 
     def text(
-        self, x: float, y: float, words: str, size: float = 2.4, anchor: str = "start", colour: str = INK, turn: float = 0,
-        halo: bool = False, bold: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        x: float,
+        y: float,
+        words: str,
+        size: float = 2.4,
+        anchor: str = "start",
+        colour: str = INK,
+        turn: float = 0,
+        halo: bool = False,
+        bold: bool = False,
+    ) -> None:
         turned = f' transform="rotate({turn} {x:.3f} {y:.3f})"' if turn else ""
         weight = ' font-weight="bold"' if bold else ""
-        base = (
-            f'x="{x:.3f}" y="{y:.3f}" font-family="{FONT}" font-size="{size}" text-anchor="{anchor}"{turned}{weight}'
-        )
+        base = f'x="{x:.3f}" y="{y:.3f}" font-family="{FONT}" font-size="{size}" text-anchor="{anchor}"{turned}{weight}'
         if halo:
-            self.parts.append(
-                f'<text {base} fill="#ffffff" stroke="#ffffff" stroke-width="0.7" stroke-linejoin="round">{escape(words)}</text>'
-            )
+            white = 'fill="#ffffff" stroke="#ffffff" stroke-width="0.7" stroke-linejoin="round"'
+            self.parts.append(f"<text {base} {white}>{escape(words)}</text>")
         self.parts.append(f'<text {base} fill="{colour}">{escape(words)}</text>')
 
     def picture(self, x: float, y: float, w: float, h: float, png_base64: str) -> None:

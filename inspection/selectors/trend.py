@@ -47,7 +47,12 @@ def trend(region: Region, metric: str, *, until: dt.datetime | None = None, now:
 
 
 def tool_trends(
-    tool: Tool, metrics: Sequence[str], *, until: dt.datetime | None = None, now: dt.datetime | None = None
+    tool: Tool,
+    metrics: Sequence[str],
+    *,
+    until: dt.datetime | None = None,
+    now: dt.datetime | None = None,
+    limit_set: LimitSet | None = None,
 ) -> list[Json]:
     """Return the history of every active region by every metric, in that order, as JSON-ready dicts without NaN.
 
@@ -56,14 +61,20 @@ def tool_trends(
     {watch, replace, unit, version} or None, ``fit`` of the present segment {axis, unit, rate, u_rate, n,
     low_confidence, line: [{t, life, value, low, high}]} or None, ``segments`` [{first, last, n, rate, u_rate}],
     ``forecast`` {limit_name, limit, at, earliest, latest, at_date, earliest_date, latest_date, remaining} or None, and
-    ``sentence``. ``until`` leaves out everything later (a report shows what was known then).
+    ``sentence``. ``until`` leaves out everything later and ``limit_set`` replaces the
+    limits now in force: a report shows what was known and what counted then.
     """
     regions = [region for region in tool.regions.all() if region.active]
-    return _trends(tool, regions, list(metrics), until, now)
+    return _trends(tool, regions, list(metrics), until, now, limit_set)
 
 
 def _trends(
-    tool: Tool, regions: Sequence[Region], metrics: Sequence[str], until: dt.datetime | None, now: dt.datetime | None
+    tool: Tool,
+    regions: Sequence[Region],
+    metrics: Sequence[str],
+    until: dt.datetime | None,
+    now: dt.datetime | None,
+    limit_set: LimitSet | None = None,
 ) -> list[Json]:
     now = now or timezone.now()
     newest = RangeImage.objects.filter(scan=OuterRef("range_image__scan")).order_by("-created_at", "-pk").values("pk")
@@ -92,17 +103,19 @@ def _trends(
     for row in rows:
         by_series[row["region"], row["metric"]].append(row)
     happened = list(events)
-    limits = _limits_in_force(tool, metrics)
+    life_now = tool.life_used if until is None else 0.0  # what the tool did since is not known then
+    limits = _limits(tool, metrics, limit_set)
     return [
-        _one(tool, region, metric, by_series[region.pk, metric], happened, limits.get(metric), now)
+        _one(tool, region, metric, by_series[region.pk, metric], happened, limits.get(metric), now, life_now)
         for region in regions
         for metric in metrics
     ]
 
 
-def _limits_in_force(tool: Tool, metrics: Iterable[str]) -> dict[str, Limit]:
+def _limits(tool: Tool, metrics: Iterable[str], limit_set: LimitSet | None) -> dict[str, Limit]:
     newest = LimitSet.objects.filter(tool_type=tool.tool_type_id).order_by("-version").values("pk")[:1]
-    found = Limit.objects.filter(limit_set=Subquery(newest), metric__in=metrics).select_related("limit_set")
+    wanted = Subquery(newest) if limit_set is None else limit_set.pk
+    found = Limit.objects.filter(limit_set=wanted, metric__in=metrics).select_related("limit_set")
     return {limit.metric: limit for limit in found}
 
 
@@ -114,6 +127,7 @@ def _one(
     events: Sequence[Event],
     limit: Limit | None,
     now: dt.datetime,
+    life_now: float,
 ) -> Json:
     ends = [event.at for event in events if event.kind in Event.SEGMENT_ENDS]
     numbers = segment_of([row["at"] for row in rows], ends)
@@ -153,7 +167,7 @@ def _one(
             "unit": limit.unit,
             "version": limit.limit_set.version,
         }
-    forecast, sentence = _forecast(tool, label, unit, limit, fit, readings[present], now)
+    forecast, sentence = _forecast(tool, label, unit, limit, fit, readings[present], now, life_now)
     return {
         "tool": {"id": tool.pk, "code": tool.code},
         "region": {"id": region.pk, "name": region.name},
@@ -199,16 +213,18 @@ def _forecast(
     fit: SegmentFit | None,
     readings: Sequence[Reading],
     now: dt.datetime,
+    life_now: float,
 ) -> tuple[Json | None, str]:
     bounds = [("replace", limit.replace_above), ("watch", limit.watch_above)] if limit else []
     name, bound = next(((name, bound) for name, bound in bounds if bound is not None), ("", None))
     if limit is None or bound is None:
         return None, f"No limit is set for {label}, so there is nothing to forecast."
     if unit != limit.unit:
-        return None, f"The limit of {label} is in {unit_sign(limit.unit)} but it is measured in {unit_sign(unit)}, so they are not compared."
+        units = f"is in {unit_sign(limit.unit)} but it is measured in {unit_sign(unit)}"
+        return None, f"The limit of {label} {units}, so they are not compared."
     place: float | None = None
     if fit is not None:
-        place = fit.position(now) if fit.axis == "date" else max(tool.life_used, fit.wear.last_life)
+        place = fit.position(now) if fit.axis == "date" else max(life_now, fit.wear.last_life)
     sentence, times = forecast_sentence(
         label=label,
         unit=unit,
@@ -273,4 +289,3 @@ def _fit_json(fit: SegmentFit, unit: str, life_unit: str, forecast: Json | None)
         "low_confidence": wear.low_confidence,
         "line": line,
     }
-

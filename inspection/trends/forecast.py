@@ -10,8 +10,8 @@ import datetime as dt
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from inspection.units import unit_sign
 from inspection.trends.wear import POINTS_FOR_RATE, TimeToLimit, WearFit, fit_wear
+from inspection.units import unit_sign
 
 DAY_S = 86400.0
 

@@ -41,10 +41,11 @@ class Command(BaseCommand):
                 for token in ApiToken.objects.select_related("owner"):
                     ended = f"revoked {token.revoked_at:%Y-%m-%d}" if token.revoked_at else "live"
                     used = f"{token.last_used_at:%Y-%m-%d %H:%M}" if token.last_used_at else "never"
-                    self.stdout.write(f"{token.start}  {token.scope:5}  {token.owner}  {token.name}  used {used}  {ended}")
+                    whose = f"{token.start}  {token.scope:5}  {token.owner}  {token.name}"
+                    self.stdout.write(f"{whose}  used {used}  {ended}")
             case "revoke":
                 found = list(ApiToken.objects.select_related("owner").filter(start=options["start"], revoked_at=None))
                 if len(found) != 1:
-                    raise CommandError(f"{len(found)} live tokens start with {options['start']!r}; give one that exists.")
+                    raise CommandError(f"{len(found)} live tokens start with {options['start']!r}; see `token list`.")
                 revoke_token(found[0], by=found[0].owner)
                 self.stdout.write(f"{found[0]} is revoked.")

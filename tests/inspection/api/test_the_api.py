@@ -63,7 +63,10 @@ def strict(answer):
 
 def reads() -> list[str]:
     return [
-        path.replace("{tool_id}", "1").replace("{scan_id}", "1").replace("{inspection_id}", "1").replace("{slug}", "rig-1")
+        path.replace("{tool_id}", "1")
+        .replace("{scan_id}", "1")
+        .replace("{inspection_id}", "1")
+        .replace("{slug}", "rig-1")
         for path, ways in api.get_openapi_schema(path_prefix="")["paths"].items()
         if "get" in ways
     ]
@@ -267,7 +270,9 @@ def test_the_trend_holds_the_forecast(reader):
 def test_an_order_is_queued_and_visible(planner):
     plant.knife()
     plant.rig()
-    told = strict(planner.post("/inspections", {"tool": "K-114", "rig": "rig-1", "regions": ["R3", "R1"], "reason": "noise"}))
+    told = strict(
+        planner.post("/inspections", {"tool": "K-114", "rig": "rig-1", "regions": ["R3", "R1"], "reason": "noise"})
+    )
     assert [scan["region"] for scan in told["scans"]] == ["R1", "R3"]
     assert {scan["state"] for scan in told["scans"]} == {"queued"}
     assert (told["requested_by"], told["reason"], told["verdict"]) == ("robot-operator", "noise", "unknown")
@@ -331,7 +336,8 @@ def test_a_malformed_body_is_never_a_crash(planner, raw):
 
 
 @pytest.mark.parametrize(
-    "address", ["/scans/0", "/scans/99999999999999999999", "/scans/x", "/tools/77", "/rigs/none/queue", "/inspections/-1"]
+    "address",
+    ["/scans/0", "/scans/99999999999999999999", "/scans/x", "/tools/77", "/rigs/none/queue", "/inspections/-1"],
 )
 def test_what_is_not_there_is_said_in_one_sentence(reader, address):
     answer = reader.get(address)

@@ -11,8 +11,23 @@ import numpy as np
 from django.conf import settings
 
 from inspection.models import (
-    Calibration, Damage, Event, Inspection, Limit, LimitSet, Measurement, PrecisionReport, RangeImage, Recipe, Region,
-    Rig, Role, Scan, Tool, ToolType, User,
+    Calibration,
+    Damage,
+    Event,
+    Inspection,
+    Limit,
+    LimitSet,
+    Measurement,
+    PrecisionReport,
+    RangeImage,
+    Recipe,
+    Region,
+    Rig,
+    Role,
+    Scan,
+    Tool,
+    ToolType,
+    User,
 )  # fmt: skip
 from inspection.states import ScanState, Verdict
 

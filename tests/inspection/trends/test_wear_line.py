@@ -72,9 +72,11 @@ def test_at_the_interval_ends_the_bounds_touch_the_limit(limit):
 
 def test_a_slope_that_may_be_zero_gives_no_upper_bound_but_an_earliest_time():
     fit = fit_wear([0, 1, 2, 3, 4], [10, 12, 9, 13, 11])
-    assert fit is not None and fit.rate > 0
+    assert fit is not None
+    assert fit.rate > 0
     forecast = fit.time_to_limit(40)
-    assert forecast.at is not None and forecast.latest is None
+    assert forecast.at is not None
+    assert forecast.latest is None
     assert fit.value(forecast.earliest) + fit.half_width(forecast.earliest) == pytest.approx(40, abs=1e-9)
     assert forecast.earliest > 4
 
@@ -95,7 +97,8 @@ def test_the_measurement_uncertainty_is_the_floor_of_the_scatter():
 
 def test_three_points_give_a_rate_without_an_interval():
     fit = fit_wear([0, 1, 2], [0, 1, 2])
-    assert fit is not None and fit.low_confidence
+    assert fit is not None
+    assert fit.low_confidence
     forecast = fit.time_to_limit(10)
     assert forecast.at == pytest.approx(10)
     assert (forecast.earliest, forecast.latest) == (None, None)
