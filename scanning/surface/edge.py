@@ -71,7 +71,9 @@ def find_edge(
     light = smooth(residual_um, valid, (0.8, 0.8))
     sigma = robust_sigma(light.value[valid])
     limit = max(3.0 * sigma, 0.5)
-    sound = valid & (light.value > -limit * np.maximum(light.spread, 1.0))
+    # Heights well above the bevel are no bevel either: a burr is lower than this, stray light is not.
+    above = max(10.0 * sigma, 50.0)
+    sound = valid & (light.value > -limit * np.maximum(light.spread, 1.0)) & (light.value < above)
     dense = ndimage.uniform_filter(sound.astype(np.float32), size=(5, 3), mode="nearest") >= 0.5
     body = sound & dense
     ends: dict[str, Float64] = {}

@@ -126,6 +126,7 @@ def wild_pixels(
     at most one of its eight neighbours agrees with it; with two, when the group it belongs to is smaller than
     anything the optics can resolve (25 um, the width of the laser line, in one direction, or 4 pixels in all). The
     corner of a real pit has three agreeing neighbours and stays; a one-profile groove is not measurable and goes.
+    Neighbourhoods of which a quarter disagrees are wild as a whole.
     """
     tolerance = np.float32(6.0 * noise_um)
     around = smooth(residual_um, valid, (1.5, 1.5)).value
@@ -134,6 +135,11 @@ def wild_pixels(
     candidate = valid & (np.abs(filled - median) > tolerance)
     if not candidate.any():
         return np.asarray(candidate)
+    # Stray light beyond an edge is answered by dense wrong heights: where a quarter of a neighbourhood disagrees
+    # with its own median, none of it is a surface.
+    measured = cv2.blur(valid.astype(np.float32), (9, 9))
+    disagreeing = cv2.blur(candidate.astype(np.float32), (9, 9))
+    chaos = valid & (disagreeing > 0.25 * measured)
     rows, profiles = np.nonzero(candidate)
     padded = np.pad(np.where(valid, residual_um, np.float32(np.nan)), 1, constant_values=np.nan)
     own = residual_um[rows, profiles]
@@ -145,7 +151,7 @@ def wild_pixels(
                 agreeing += np.abs(other - own) <= tolerance
     lonely = np.zeros_like(candidate)
     lonely[rows[agreeing == 2], profiles[agreeing == 2]] = True
-    wild = np.zeros_like(candidate)
+    wild = chaos
     wild[rows[agreeing < 2], profiles[agreeing < 2]] = True
     labels, _ = label(lonely)
     for number, place in enumerate(ndimage.find_objects(labels), start=1):
@@ -155,3 +161,33 @@ def wild_pixels(
         if np.count_nonzero(group) <= 4 or min(height_um, width_um) <= 25.0:
             wild[place] |= group
     return np.asarray(wild)
+
+
+def too_narrow_to_see(
+    residual_um: Float32, valid: Mask, *, noise_um: float, profile_pitch_um: float, aspect: float
+) -> Mask:
+    """Find depths no camera could have seen: runs of profiles narrower than ``aspect`` times their depth.
+
+    The camera looks down at 60 degrees: the floor of a slot is hidden unless the slot is at least 0.58 times as wide
+    (along the scan) as it is deep. A narrower run, with the surface or nothing on both sides, is a reflection taken
+    for the line. Runs that reach the border of the image are left alone. Works row by row; returns a mask.
+    """
+    deep = valid & (residual_um < -max(10.0 * noise_um, 30.0))
+    hidden = np.zeros_like(valid)
+    if not deep.any():
+        return hidden
+    padded = np.pad(deep.astype(np.int8), ((0, 0), (1, 1)))
+    change = np.diff(padded, axis=1)
+    rows, starts = np.nonzero(change == 1)
+    _, ends = np.nonzero(change == -1)
+    order = np.lexsort((starts, rows))
+    rows, starts, ends = rows[order], starts[order], ends[order]
+    flat = np.where(deep, -residual_um, np.float32(0.0)).ravel()
+    width = residual_um.shape[1]
+    # reduceat over [start, end) pairs; every second result is the gap between two runs.
+    bounds = np.stack([rows * width + starts, rows * width + ends], axis=1).ravel()
+    depth = np.add.reduceat(np.append(flat, np.float32(0.0)), bounds)[::2] / (ends - starts)
+    narrow = ((ends - starts) * profile_pitch_um < aspect * depth) & (starts > 0) & (ends < width)
+    for row, start, end in zip(rows[narrow], starts[narrow], ends[narrow], strict=True):
+        hidden[row, start:end] = True
+    return hidden

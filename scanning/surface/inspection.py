@@ -16,7 +16,7 @@ from scanning.errors import BadInput
 from scanning.range_image import RangeImage
 from scanning.surface.damage import DamageFinding, detect, findings, lost_at_edge
 from scanning.surface.edge import distance_to_edge_um, expected_surface, find_edge, roll_off
-from scanning.surface.filters import Float32, Float64, Mask, dilate, label, wild_pixels
+from scanning.surface.filters import Float32, Float64, Mask, dilate, label, too_narrow_to_see, wild_pixels
 from scanning.surface.noise import Noise, local_noise, measure_noise, robust_sigma
 from scanning.surface.numbers import burr_numbers, damage_numbers, edge_numbers, quality_numbers, roughness_numbers
 from scanning.surface.plane import fit_plane
@@ -28,6 +28,8 @@ from scanning.surface.uncertainty import budget
 
 #: The roughness patch keeps this distance from damage and from the edge.
 KEEP_AWAY_UM = 100.0
+#: A damage deeper than this whose floor is flat is remarked on.
+CLIFF_UM = 300.0
 #: Scatter of single heights above which the heights themselves are in doubt.
 LOUD_UM = 50.0
 #: A damage across the whole bevel narrower than this is remarked on.
@@ -114,7 +116,9 @@ def _inspect(
     height = _clean(image, settings, warnings)
     plane = fit_plane(height, row_pitch, profile_pitch, form=settings.form)
     residual = (height - plane.height_um()).astype(np.float32)
-    residual = _without_wild(residual, row_pitch, profile_pitch, warnings)
+    # The camera's view is tilted along the scan, whichever way the edge runs.
+    aspect = settings.visible_aspect if settings.edge_axis == 1 else 0.0
+    residual = _without_wild(residual, row_pitch, profile_pitch, aspect, warnings)
 
     edge_reference: Float64 | None = None
     registration: Registration | None = None
@@ -232,20 +236,25 @@ def _clean(image: RangeImage, settings: InspectionSettings, warnings: list[str])
     return height
 
 
-def _without_wild(residual: Float32, row_pitch: float, profile_pitch: float, warnings: list[str] | None) -> Float32:
+def _without_wild(
+    residual: Float32, row_pitch: float, profile_pitch: float, visible_aspect: float, warnings: list[str] | None
+) -> Float32:
     valid = np.isfinite(residual)
     noise = local_noise(residual, row_pitch, profile_pitch)
     if not noise > 0.0:
         return residual
     wild = wild_pixels(residual, valid, noise_um=noise, row_pitch_um=row_pitch, profile_pitch_um=profile_pitch)
+    wild |= too_narrow_to_see(
+        residual, valid & ~wild, noise_um=noise, profile_pitch_um=profile_pitch, aspect=visible_aspect
+    )
     count = int(np.count_nonzero(wild))
     if not count:
         return residual
     if warnings is not None:
         share = 100.0 * count / int(np.count_nonzero(valid))
         warnings.append(
-            f"{count} isolated wild pixels ({share:.2f} % of the measured) "
-            "were set aside: wrong peaks smaller than the laser line can resolve."
+            f"{count} wild pixels ({share:.2f} % of the measured) were set aside: wrong peaks smaller than the laser "
+            "line can resolve, without order, or deeper than a camera at 60 degrees can look into so narrow a gap."
         )
     return np.where(wild, np.float32(np.nan), residual).astype(np.float32)
 
@@ -261,7 +270,11 @@ def _against_baseline(
     other = np.where(np.isfinite(baseline.height_um), baseline.height_um, np.float32(np.nan)).astype(np.float32)
     other_plane = fit_plane(other, baseline.row_pitch_um, baseline.profile_pitch_um, form=settings.form)
     other = _without_wild(
-        (other - other_plane.height_um()).astype(np.float32), baseline.row_pitch_um, baseline.profile_pitch_um, None
+        (other - other_plane.height_um()).astype(np.float32),
+        baseline.row_pitch_um,
+        baseline.profile_pitch_um,
+        settings.visible_aspect,
+        None,
     )
     own_pitches = (baseline.row_pitch_um, baseline.profile_pitch_um)
     shape = (residual.shape[0], residual.shape[1])
@@ -339,6 +352,12 @@ def _remark(
             warnings.append(
                 f"Damage {one.number} crosses the whole bevel but is only {1e3 * one.length_mm:.0f} um wide; a jump of "
                 "the stage looks the same. Scan again before acting on it."
+            )
+    for one in damages:
+        if one.depth_um > CLIFF_UM and one.mean_depth_um > 0.8 * one.depth_um:
+            warnings.append(
+                f"Damage {one.number} is a flat floor {one.depth_um:.0f} um down without slopes; a reflection taken "
+                "for the laser line looks the same. Look at the scan images there before acting on it."
             )
     if noise.shape_um > max(1.0, 0.5 * noise.sigma_um):
         warnings.append(

@@ -42,6 +42,8 @@ class InspectionSettings:
     when known from elsewhere; None means not known, and every affected number says so.
     ``u_linearity_um``: what a straight calibration line leaves out inside its range (0.6 um on IS1).
     ``instrument_noise_um``: Sq of the instrument's own noise on the scale-limited surface, from a displaced repeat.
+    ``visible_aspect``: gaps narrower than this times their depth cannot be seen by the camera (0.58 at 60 degrees) and
+    are reflections; 0 for surfaces measured from straight above.
     ``saturation_level``: pixels whose peak intensity reaches it are not used; None uses all.
     """
 
@@ -63,6 +65,7 @@ class InspectionSettings:
     u_linearity_um: float = 0.6
     instrument_noise_um: float | None = None
     saturation_level: float | None = None
+    visible_aspect: float = 0.5
     s_filter_um: float | None = None
     l_filter_um: float | None = None
 

@@ -81,3 +81,33 @@ def test_heights_without_any_sense_are_doubted():
     rng = np.random.default_rng(1)
     report = inspect_surface(range_image(rng.uniform(0, 2000, (200, 200))))
     assert any("wrong peaks" in warning for warning in report.warnings)
+
+
+def test_a_gap_deeper_than_the_camera_can_look_into_is_a_reflection():
+    """The camera sees the floor of a slot only when it is 0.58 times as wide as deep (60 degrees)."""
+    height = surface((600, 241)).height_um.copy()
+    height[300:400, 100:104] -= 700.0
+    height[300:400, 150:153] -= 1100.0
+    report = inspect_surface(range_image(height))
+    assert report.damages == []
+
+
+def test_a_flat_floor_far_down_is_doubted():
+    height = surface((600, 241)).height_um.copy()
+    height[300:400, 100:180] -= 700.0
+    report = inspect_surface(range_image(height))
+    assert len(report.damages) == 1
+    assert any("without slopes" in warning for warning in report.warnings)
+
+
+def test_stray_light_beyond_the_edge_dense_enough_to_look_measured():
+    image = knife()
+    height = image.height_um.copy()
+    beyond = np.isnan(height)
+    beyond[:920] = False
+    beyond[960:] = False
+    height[beyond] = 250.0 + np.random.default_rng(2).normal(0.0, 120.0, int(beyond.sum()))
+    report = inspect_surface(range_image(height))
+    assert report.damages == []
+    assert report.edge is not None
+    assert report.edge.reference_row[120] == pytest.approx(932.0, abs=3.0)
