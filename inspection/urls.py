@@ -6,7 +6,19 @@ from django.urls import URLPattern, URLResolver, include, path
 
 from inspection.api import api
 from inspection.health import health
-from inspection.views import calibrations, imports, overview, people, ranges, records, rigs, rules, scans, schedules, tools
+from inspection.views import (
+    calibrations,
+    imports,
+    overview,
+    people,
+    ranges,
+    records,
+    rigs,
+    rules,
+    scans,
+    schedules,
+    tools,
+)
 
 tool_urls = [
     path("new/", tools.tool_new, name="tool-new"),

@@ -26,11 +26,15 @@ class CalibrationForm(forms.Form):
         required=False,
         strip=False,
         max_length=200_000,
-        widget=forms.Textarea(attrs={"rows": 9, "class": "mono", "placeholder": "height_mm,column_px\n0.00,112.4\n0.10,119.5\n…"}),
+        widget=forms.Textarea(
+            attrs={"rows": 9, "class": "mono", "placeholder": "height_mm,column_px\n0.00,112.4\n0.10,119.5\n…"}
+        ),
     )
     artefact = forms.CharField(label="Gauge and its certificate", max_length=200)
     done_on = forms.DateField(label="Done on", widget=forms.DateInput(attrs={"type": "date"}, format="%Y-%m-%d"))
-    valid_until = forms.DateField(label="Valid until", widget=forms.DateInput(attrs={"type": "date"}, format="%Y-%m-%d"))
+    valid_until = forms.DateField(
+        label="Valid until", widget=forms.DateInput(attrs={"type": "date"}, format="%Y-%m-%d")
+    )
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -55,11 +59,13 @@ class LimitsForm(forms.Form):
 
     reason = forms.CharField(max_length=300, help_text="Why the limits change. It stays in the history for good.")
 
-    def __init__(self, *args: Any, metrics: list[tuple[str, str, str]], current: LimitSet | None, **kwargs: Any) -> None:
+    def __init__(
+        self, *args: Any, metrics: list[tuple[str, str, str]], current: LimitSet | None, **kwargs: Any
+    ) -> None:
         super().__init__(*args, **kwargs)
         self.metrics = metrics
         limits = {limit.metric: limit for limit in current.limits.all()} if current else {}
-        for metric, label, unit in metrics:
+        for metric, label, _unit in metrics:
             limit = limits.get(metric)
             for kind, word in (("watch", "watch above"), ("replace", "replace above")):
                 self.fields[f"{kind}:{metric}"] = forms.FloatField(
@@ -69,7 +75,9 @@ class LimitsForm(forms.Form):
 
     def limited(self) -> list[dict[str, Any]]:
         """The metrics that have a limit now, or came back with one."""
-        return [row for row in self.rows() if any(bound.value() not in (None, "") or bound.errors for bound in row["pair"])]
+        return [
+            row for row in self.rows() if any(bound.value() not in (None, "") or bound.errors for bound in row["pair"])
+        ]
 
     def others(self) -> list[dict[str, Any]]:
         limited = {row["metric"] for row in self.limited()}
@@ -77,7 +85,12 @@ class LimitsForm(forms.Form):
 
     def rows(self) -> list[dict[str, Any]]:
         return [
-            {"metric": metric, "label": label, "unit": unit, "pair": [self[f"watch:{metric}"], self[f"replace:{metric}"]]}
+            {
+                "metric": metric,
+                "label": label,
+                "unit": unit,
+                "pair": [self[f"watch:{metric}"], self[f"replace:{metric}"]],
+            }
             for metric, label, unit in self.metrics
         ]
 

@@ -12,7 +12,7 @@ from django.utils import timezone
 from inspection.models import Recipe, Region, Rig, Schedule, Tool
 
 
-class RecipeChoice(forms.ModelChoiceField):
+class RecipeChoice(forms.ModelChoiceField):  # type: ignore[type-arg]  # not subscriptable at run time
     def label_from_instance(self, obj: Any) -> str:
         return f"{obj.name} ({obj.sha256[:8]})"
 
@@ -28,7 +28,9 @@ class ScanOrderForm(forms.Form):
         required=False,
         help_text="Comma-separated, for example 100, 300, 900. Empty takes the rig's own bracket.",
     )
-    reason = forms.CharField(max_length=200, required=False, help_text="For example “after collision” or “weekly check”.")
+    reason = forms.CharField(
+        max_length=200, required=False, help_text="For example “after collision” or “weekly check”."
+    )
 
     def __init__(self, *args: Any, tool: Tool, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -113,7 +115,7 @@ class FilesField(forms.FileField):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, widget=ManyFiles(attrs={"multiple": True}), **kwargs)
 
-    def clean(self, data: Any, initial: Any = None) -> list[UploadedFile]:  # type: ignore[override]
+    def clean(self, data: Any, initial: Any = None) -> list[UploadedFile[Any]]:
         files = data if isinstance(data, list | tuple) else [data]
         return [super(FilesField, self).clean(file, initial) for file in files]
 
@@ -131,7 +133,7 @@ class ImportForm(forms.Form):
         help_text="Otherwise heights rest on the stack's own mm_per_pixel and the verdict stays unknown.",
     )
     recipe = RecipeChoice(Recipe.objects.none(), required=False, empty_label="What fits the recorded exposures")
-    files = FilesField(
+    stack = FilesField(
         label="Files",
         help_text="One zip of the stack folder, or all its files at once: stack.json and the TIFF or PNG frames.",
     )

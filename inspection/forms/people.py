@@ -41,4 +41,5 @@ class PersonForm(forms.ModelForm):  # type: ignore[type-arg]  # not subscriptabl
     def save(self, commit: bool = True) -> User:
         if self.cleaned_data["password"]:
             self.instance.set_password(self.cleaned_data["password"])
-        return super().save(commit)
+        saved: User = super().save(commit)
+        return saved

@@ -85,7 +85,12 @@ class EventForm(forms.ModelForm):  # type: ignore[type-arg]  # not subscriptable
         model = Event
         fields = ("kind", "at", "life_used", "removed_mm", "note")
         widgets = {"at": forms.DateTimeInput(attrs={"type": "datetime-local"}, format="%Y-%m-%dT%H:%M")}
-        labels = {"kind": "What happened", "at": "When", "life_used": "Use at that moment", "removed_mm": "Stock removed"}
+        labels = {
+            "kind": "What happened",
+            "at": "When",
+            "life_used": "Use at that moment",
+            "removed_mm": "Stock removed",
+        }
         help_texts = {"removed_mm": ""}
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:

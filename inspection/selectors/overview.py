@@ -20,8 +20,10 @@ from inspection.states import LIVE, VERDICT_ORDER, ScanState, Verdict
 
 
 def newest_results(regions: QuerySet[Region]) -> QuerySet[Region]:
-    """Annotate each region with the newest range image of its newest finished scan (``newest_id``), and with how its last
-    scan ended, well or badly (``last_state``)."""
+    """Annotate each region with the range image to show (``newest_id``) and how its last scan ended (``last_state``).
+
+    To show is the newest range image of the newest finished scan.
+    """
     newest = RangeImage.objects.filter(scan__region=OuterRef("pk"), scan__state=ScanState.DONE)
     ended = Scan.objects.filter(region=OuterRef("pk"), finished_at__isnull=False).order_by("-finished_at", "-pk")
     return regions.annotate(
@@ -151,7 +153,9 @@ def _rows(tools: list[Tool]) -> list[ToolRow]:
     for schedule in Schedule.objects.filter(tool__in=ids, enabled=True).order_by("-next_due"):
         schedules[schedule.tool_id] = schedule  # the earliest comes last and stays
     live: dict[int, list[Scan]] = defaultdict(list)
-    for scan in Scan.objects.filter(state__in=LIVE, region__tool__in=ids).select_related("region").order_by("region__name"):
+    for scan in (
+        Scan.objects.filter(state__in=LIVE, region__tool__in=ids).select_related("region").order_by("region__name")
+    ):
         live[scan.region.tool_id].append(scan)
     return [
         ToolRow(

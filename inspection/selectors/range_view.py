@@ -61,7 +61,7 @@ class Picture:
     span: tuple[float, float]
 
     def headers(self) -> dict[str, str]:
-        """``X-Shape`` rows,columns; ``X-Origin-mm`` and ``X-Cell-mm`` across,along the edge, of the first cell's centre."""
+        """``X-Shape`` rows,columns; ``X-Origin-mm`` and ``X-Cell-mm`` across,along the edge, of the first cell."""
         return {
             "X-Shape": "{},{}".format(*self.counts.shape),
             "X-Scale": repr(self.scale),
@@ -87,8 +87,8 @@ def _written_at(file: str) -> int:
 
 def _unreadable(file: str, error: Exception) -> BadInput:
     return BadInput(
-        f"The range image file {Path(file).name} cannot be read ({type(error).__name__}); restore it from the backup or "
-        "compute the scan again."
+        f"The range image file {Path(file).name} cannot be read ({type(error).__name__}); restore it from the backup "
+        "or compute the scan again."
     )
 
 
@@ -111,7 +111,8 @@ def _reference(file: str, written_at: int, stored: tuple[float, ...] | None, pit
     height = _arrays(file, written_at)["height"]
     if stored is None:
         try:
-            return fit_plane(height, *pitches).height_um()
+            fitted: Float32 = fit_plane(height, *pitches).height_um()
+            return fitted
         except BadInput:
             # No plane agrees with this surface: show it about its median, which bends nothing.
             middle = np.nanmedian(height) if np.isfinite(height).any() else 0.0
@@ -142,15 +143,17 @@ def _stored_plane(image: RangeImage) -> tuple[float, ...] | None:
 
 
 def values(image: RangeImage, channel: str) -> Float32:
-    """One channel in full, (rows, profiles), NaN = not measured. Raises BadInput for an unknown channel or lost file."""
+    """One channel in full, (rows, profiles), NaN = not measured. BadInput: no such channel, or a lost file."""
     if channel not in CHANNELS:
         raise BadInput(f"There is no channel “{channel}”; choose one of {', '.join(CHANNELS)}.")
     file = str(file_of(image))
     written_at = _written_at(file)
-    arrays = _arrays(file, written_at)
+    arrays: dict[str, Float32] = _arrays(file, written_at)
     if channel != "level":
-        measured = arrays[channel]
-        return measured if channel == "height" else np.where(np.isfinite(arrays["height"]), measured, np.float32(np.nan))
+        measured: Float32 = arrays[channel]
+        return (
+            measured if channel == "height" else np.where(np.isfinite(arrays["height"]), measured, np.float32(np.nan))
+        )
     pitches = (image.row_pitch_um, image.profile_pitch_um)
     return arrays["height"] - _reference(file, written_at, _stored_plane(image), pitches)
 
@@ -205,7 +208,9 @@ def cut(image: RangeImage, channel: str, row: int, profile: int) -> dict[str, An
     """The two profiles through one pixel at full resolution, JSON-ready: NaN is null."""
     data = values(image, channel)
     if not (0 <= row < data.shape[0] and 0 <= profile < data.shape[1]):
-        raise BadInput(f"Row {row}, profile {profile} lies outside the range image of {data.shape[0]} x {data.shape[1]}.")
+        raise BadInput(
+            f"Row {row}, profile {profile} lies outside the range image of {data.shape[0]} x {data.shape[1]}."
+        )
     return {
         "unit": CHANNELS[channel][1],
         "row": row,
@@ -231,8 +236,8 @@ def difference(newer: RangeImage, older: RangeImage) -> Float32:
     if not same:
         raise BadInput(
             f"The two scans have different pitches ({newer.row_pitch_um:.2f} x {newer.profile_pitch_um:.2f} um and "
-            f"{older.row_pitch_um:.2f} x {older.profile_pitch_um:.2f} um), so they cannot be subtracted; compute one of "
-            "them again with the recipe of the other."
+            f"{older.row_pitch_um:.2f} x {older.profile_pitch_um:.2f} um), so they cannot be subtracted; compute one "
+            "of them again with the recipe of the other."
         )
     a, b = values(newer, "level"), values(older, "level")
     rows, profiles = min(a.shape[0], b.shape[0]), min(a.shape[1], b.shape[1])

@@ -15,7 +15,8 @@ from inspection.selectors.range_view import damage_box
 from inspection.selectors.tool import Number, key_numbers, numbers
 from inspection.states import ScanState
 
-
+#: More colours than this in one bar cannot be told apart.
+MOST_PARTS: Final = 5
 #: What a scan goes through, as a person at the rig sees it.
 PHASES: Final = ("home", "scan", "compute")
 
@@ -49,7 +50,7 @@ class Progress:
 
 
 def progress_version(scan: Scan, now: dt.datetime | None = None) -> str:
-    """Changes whenever the progress fragment would, from the scan's own row alone: polls that find nothing new are free."""
+    """Changes whenever the progress fragment would, from the scan's own row alone, so idle polls are free."""
     now = now or timezone.now()
     asked = (scan.cancel_requested_at, scan.pause_requested_at, scan.finish_requested_at)
     text = f"{scan.state}|{scan.phase}|{scan.done}|{scan.total}|{scan.message}|{asked}"
@@ -132,7 +133,7 @@ def scan_of(pk: int) -> Scan:
 
 
 def scan_state(scan: Scan, result_pk: int | None = None) -> ScanPage:
-    """Everything the scan page shows. ``result_pk`` picks an older range image; unknown ones fall back to the newest."""
+    """Everything the scan page shows. ``result_pk`` picks an older range image; unknown ones give the newest."""
     results = list(scan.range_images.select_related("recipe").defer("provenance", "surface"))
     chosen = next((image for image in results if image.pk == result_pk), results[0] if results else None)
     return ScanPage(
@@ -140,7 +141,7 @@ def scan_state(scan: Scan, result_pk: int | None = None) -> ScanPage:
         results=results,
         result=_result(chosen.pk, newest=chosen is results[0]) if chosen else None,
         time_budget=time_budget(scan.acquisition),
-        link=scan.acquisition.get("link_quality") or scan.acquisition.get("link") or {},
+        link=scan.acquisition.get("link") or {},
         comparable=comparable(scan),
         recomputations=list(
             scan.recomputations.exclude(state=Recomputation.State.DONE).select_related("recipe", "requested_by")
@@ -179,13 +180,15 @@ def comparable(scan: Scan) -> list[RangeImage]:
 
 
 def time_budget(acquisition: dict[str, Any]) -> list[TimePart]:
-    """Where the time of a scan went, largest first: every figure of the run's summary that is in seconds."""
-    budget = acquisition.get("time_budget") or acquisition.get("budget") or acquisition
+    """Where the time of a scan went, largest first; small parts beyond the first five are summed as "other"."""
+    spent = acquisition.get("time") or {}
     parts = {
-        key.removesuffix("_s").replace("_", " "): float(value)
-        for key, value in budget.items()
-        if key.endswith("_s") and not key.startswith(("total", "wall", "elapsed")) and isinstance(value, int | float)
+        name.removesuffix("_s").replace("_", " "): float(seconds)
+        for name, seconds in spent.items()
+        if name != "wall_s" and seconds > 0
     }
     total = sum(parts.values())
     ordered = sorted(parts.items(), key=lambda part: -part[1])
-    return [TimePart(name, seconds, seconds / total) for name, seconds in ordered if total > 0 and seconds > 0]
+    rest = sum(seconds for _, seconds in ordered[MOST_PARTS:])
+    shown = ordered[:MOST_PARTS] + ([("other", rest)] if rest else [])
+    return [TimePart(name, seconds, seconds / total) for name, seconds in shown]

@@ -92,7 +92,6 @@ def key_numbers(all_numbers: list[Number]) -> list[Number]:
     return (limited + rest)[:MOST_KEY_NUMBERS] or all_numbers[:MOST_KEY_NUMBERS]
 
 
-
 def tool_state(tool: Tool) -> ToolState:
     """Everything the tool page shows, in a fixed number of queries."""
     regions = list(newest_results(Region.objects.filter(tool=tool, active=True)))

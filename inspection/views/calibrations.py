@@ -1,4 +1,4 @@
-"""Calibrations: what holds for each rig, how good it is, and a new one from gauge pairs with a look before it counts."""
+"""Calibrations: what holds for each rig, how good it is, and a new one, looked at before it counts."""
 
 from __future__ import annotations
 
@@ -64,8 +64,9 @@ def calibration_new(request: SignedIn) -> HttpResponse:
     if fit is not None:
         chart = fit_chart(fit)
         # The file cannot be put back into the page, its content can.
-        form.data = form.data.copy()
-        form.data["pairs"] = _as_csv(fit.heights_mm, fit.columns_px)
+        kept = request.POST.copy()
+        kept["pairs"] = _as_csv(fit.heights_mm, fit.columns_px)
+        form.data = kept
     return form_page(request, "rig/calibration_new.html", form, fit=fit, chart=chart, rigs=Rig.objects.exists())
 
 

@@ -17,10 +17,14 @@ def forbidden(request: HttpRequest, exception: Exception | None = None) -> HttpR
 
 
 def not_found(request: HttpRequest, exception: Exception | None = None) -> HttpResponse:
-    return render(request, "404.html", {"sentence": _sentence(exception, "There is nothing at this address.")}, status=404)
+    return render(
+        request, "404.html", {"sentence": _sentence(exception, "There is nothing at this address.")}, status=404
+    )
 
 
 def forged(request: HttpRequest, reason: str = "") -> HttpResponse:
     """The form was too old or came from elsewhere (CSRF)."""
-    sentence = "This form is no longer valid, perhaps because you signed in anew. Go back, reload the page, send it again."
+    sentence = (
+        "This form is no longer valid, perhaps because you signed in anew. Go back, reload the page, send it again."
+    )
     return render(request, "403.html", {"sentence": sentence}, status=403)

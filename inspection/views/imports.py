@@ -19,14 +19,14 @@ def import_page(request: SignedIn) -> HttpResponse:
         data = form.cleaned_data
         folder = None
         try:
-            folder = unpack_upload(data["files"])
+            folder = unpack_upload(data["stack"])
             scan = import_stack(
                 folder,
                 region=data["region"],
                 rig=data["rig"],
                 by=request.user,
                 recipe=data["recipe"],
-                original_name=data["files"][0].name or "",
+                original_name=data["stack"][0].name or "",
                 calibration=data["rig"].calibration_now() if data["use_calibration"] else None,
             )
         except Fault as fault:

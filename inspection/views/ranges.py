@@ -1,9 +1,10 @@
-"""Range images as bytes for the browser's charts. Immutable: a result is never overwritten, so it is cached for good."""
+"""Range images as bytes for the browser's charts. Immutable: a result is never overwritten, so browsers keep it."""
 
 from __future__ import annotations
 
 import hashlib
 
+from django.db.models import QuerySet
 from django.http import Http404, HttpResponse, HttpResponseNotModified, JsonResponse
 from django.views.decorators.http import require_safe
 
@@ -19,7 +20,11 @@ MOST_CELLS = 1200
 def _image(request: SignedIn, pk: int, key: str = "result") -> RangeImage:
     scan = found(Scan, pk=pk)
     wanted = request.GET.get(key, "")
-    images = RangeImage.objects.filter(scan=scan) if key == "result" else RangeImage.objects.filter(scan__region=scan.region_id)
+    images: QuerySet[RangeImage] = (
+        RangeImage.objects.filter(scan=scan)
+        if key == "result"
+        else RangeImage.objects.filter(scan__region=scan.region_id)
+    )
     if wanted:
         return found(images, pk=_whole(wanted, key))
     image = images.first()
@@ -69,7 +74,9 @@ def scan_range(request: SignedIn, pk: int) -> HttpResponse:
         channel = request.GET.get("channel") or "level"
         row, row_end = _span(request.GET.get("rows", ""), "rows", image.rows)
         profile, profile_end = _span(request.GET.get("cols", ""), "cols", image.profiles)
-        drawn = picture(values(image, channel), image, channel, Window(row, row_end, profile, profile_end), _most(request))
+        drawn = picture(
+            values(image, channel), image, channel, Window(row, row_end, profile, profile_end), _most(request)
+        )
     except Fault as fault:
         return _bad(fault)
     return _bytes(drawn, {"ETag": tag, "Cache-Control": "private, max-age=31536000, immutable"})

@@ -86,7 +86,11 @@ def _queue(now: dt.datetime) -> Finding:
         return Finding("Queue", "ok", "Nothing waits.")
     hours = (now - oldest.queued_at).total_seconds() / 3600
     tone = "watch" if hours > 4 else "ok"
-    return Finding("Queue", tone, f"The oldest order ({oldest.region}) waits since {timezone.localtime(oldest.queued_at):%d %b %H:%M}.")
+    return Finding(
+        "Queue",
+        tone,
+        f"The oldest order ({oldest.region}) waits since {timezone.localtime(oldest.queued_at):%d %b %H:%M}.",
+    )
 
 
 def _disk() -> Finding:

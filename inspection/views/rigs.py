@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from django.contrib import messages
-from django.http import HttpResponse, HttpResponseNotModified
+from django.http import HttpResponse
 from django.shortcuts import redirect, render
 from django.views.decorators.http import require_POST, require_safe
 
@@ -14,7 +14,6 @@ from inspection.selectors.queue import queue_view
 from inspection.services import queue
 from inspection.views.signed_in import SignedIn, found
 from scanning.errors import Fault
-
 
 #: Where a waiting scan can go, the icon, and what its button says.
 MOVES = [("next", "next", "Run next"), ("up", "up", "Up"), ("down", "down", "Down")]
@@ -46,7 +45,9 @@ def queue_rows(request: SignedIn, slug: str) -> HttpResponse:
 
 
 def _rows(request: SignedIn, rig: Rig, fault: str = "") -> HttpResponse:
-    return render(request, "rig/_queue.html", {"rig": rig, "queue": queue_view(rig, ended=0), "fault": fault, "moves": MOVES})
+    return render(
+        request, "rig/_queue.html", {"rig": rig, "queue": queue_view(rig, ended=0), "fault": fault, "moves": MOVES}
+    )
 
 
 def _answer(request: SignedIn, rig: Rig, act: Callable[[], object]) -> HttpResponse:

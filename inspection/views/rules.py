@@ -62,13 +62,15 @@ def limits_edit(request: SignedIn, pk: int) -> HttpResponse:
         except Fault as fault:
             refused(form, fault)
         else:
-            said(request, f"Limits v{row.version} are in force for scans ordered from now on. Old verdicts keep theirs.")
+            said(
+                request, f"Limits v{row.version} are in force for scans ordered from now on. Old verdicts keep theirs."
+            )
             return redirect("limits-history", tool_type.pk)
     return form_page(request, "plant/limits_form.html", form, tool_type=tool_type, current=current)
 
 
 def _limitable(tool_type: ToolType, current: LimitSet | None) -> list[tuple[str, str, str]]:
-    """(metric, label, unit) of all that may have a limit: those that have one, the defaults, and whatever was measured."""
+    """(metric, label, unit) of all that may have a limit: those that have one, the defaults, whatever was measured."""
     labels = _labels()
     units = {limit.metric: limit.unit for limit in current.limits.all()} if current else {}
     for metric, (_watch, _replace, unit) in DEFAULT_LIMITS.items():

@@ -25,7 +25,12 @@ DEPTH_SCALE_UM: Final = 150.0
 
 
 def _scan(pk: int) -> Scan:
-    return found(Scan.objects.select_related("region__tool__tool_type", "inspection", "rig", "recipe", "calibration", "limit_set", "requested_by"), pk=pk)
+    return found(
+        Scan.objects.select_related(
+            "region__tool__tool_type", "inspection", "rig", "recipe", "calibration", "limit_set", "requested_by"
+        ),
+        pk=pk,
+    )
 
 
 def _number(text: str | None) -> int | None:
@@ -65,7 +70,9 @@ def scan_progress(request: SignedIn, pk: int) -> HttpResponse:
     tag = f'"{progress_version(scan)}-{request.user.role}"'
     if scan.is_live and request.headers.get("If-None-Match") == tag:
         return HttpResponseNotModified(headers={"ETag": tag})
-    response = render(request, "scan/_progress.html", {"scan": scan, "progress": progress(scan), "tool": scan.region.tool})
+    response = render(
+        request, "scan/_progress.html", {"scan": scan, "progress": progress(scan), "tool": scan.region.tool}
+    )
     if scan.has_ended:
         response.status_code = STOP_POLLING
         response["HX-Refresh"] = "true"  # the page becomes the result
@@ -74,9 +81,7 @@ def scan_progress(request: SignedIn, pk: int) -> HttpResponse:
     return response
 
 
-def _asked(
-    request: SignedIn, pk: int, ask: Callable[[Scan, User | None], object], sentence: str
-) -> HttpResponse:
+def _asked(request: SignedIn, pk: int, ask: Callable[[Scan, User | None], object], sentence: str) -> HttpResponse:
     scan = _scan(pk)
     to: Scan | str = scan
     if request.POST.get("from") == "queue":
@@ -106,7 +111,9 @@ def scan_resume(request: SignedIn, pk: int) -> HttpResponse:
 
 @require_POST
 def scan_finish(request: SignedIn, pk: int) -> HttpResponse:
-    return _asked(request, pk, queue.finish_early, "Finishing early: what was scanned so far is kept and marked partial.")
+    return _asked(
+        request, pk, queue.finish_early, "Finishing early: what was scanned so far is kept and marked partial."
+    )
 
 
 @require_POST
@@ -140,8 +147,12 @@ def scan_compare(request: SignedIn, pk: int) -> HttpResponse:
     mine = scan.range_images.prefetch_related("measurements").first()
     chosen = next((image for image in others if image.pk == _number(request.GET.get("with"))), None)
     if chosen is None:
-        earlier = [image for image in others if scan.finished_at and (image.scan.finished_at or image.created_at) < scan.finished_at]
-        chosen = (earlier or others or [None])[0]
+        earlier = [
+            image
+            for image in others
+            if scan.finished_at and (image.scan.finished_at or image.created_at) < scan.finished_at
+        ]
+        chosen = next(iter(earlier or others), None)
     rows = []
     if mine and chosen:
         before = {m.metric: m for m in chosen.measurements.all()}
@@ -202,5 +213,12 @@ def _one_per_region(scans: list[Scan], newest: dict[int, RangeImage]) -> list[di
     rows = []
     for scan in chosen.values():
         image = newest.get(scan.pk)
-        rows.append({"scan": scan, "image": image, "numbers": key_numbers(numbers(image)) if image else [], "progress": progress(scan)})
+        rows.append(
+            {
+                "scan": scan,
+                "image": image,
+                "numbers": key_numbers(numbers(image)) if image else [],
+                "progress": progress(scan),
+            }
+        )
     return rows

@@ -28,7 +28,9 @@ def schedules_page(request: SignedIn) -> HttpResponse:
 
 
 def schedule_new(request: SignedIn) -> HttpResponse:
-    form = ScheduleForm(request.POST or None, initial={"tool": request.GET.get("tool"), "rig": Rig.objects.filter(active=True).first()})
+    form = ScheduleForm(
+        request.POST or None, initial={"tool": request.GET.get("tool"), "rig": Rig.objects.filter(active=True).first()}
+    )
     if request.method == "POST" and form.is_valid():
         try:
             row = save_schedule(by=request.user, **form.cleaned_data)

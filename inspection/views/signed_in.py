@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import Any, TypeVar
 
 from django.contrib import messages
+from django.core.exceptions import ObjectDoesNotExist
 from django.db.models import Model, QuerySet
 from django.forms import BaseForm
 from django.http import Http404, HttpRequest, HttpResponse
 from django.shortcuts import redirect, render
 from django_htmx.middleware import HtmxDetails
 
-from inspection.models import User
+from inspection.models import Rig, Scan, User
 from scanning.errors import Fault
 
 M = TypeVar("M", bound=Model)
@@ -39,7 +40,7 @@ def said(request: HttpRequest, sentence: str) -> None:
     messages.success(request, sentence)
 
 
-def back_with_fault(request: HttpRequest, fault: Fault, to: str | Model) -> HttpResponse:
+def back_with_fault(request: HttpRequest, fault: Fault, to: str | Scan | Rig) -> HttpResponse:
     """Return to a page with the fault's sentence at its top."""
     messages.error(request, str(fault))
     return redirect(to)
@@ -47,9 +48,9 @@ def back_with_fault(request: HttpRequest, fault: Fault, to: str | Model) -> Http
 
 def found(rows: QuerySet[M] | type[M], **lookup: Any) -> M:
     """The one row, or a 404 that says what was looked for."""
-    queryset = rows if isinstance(rows, QuerySet) else rows._default_manager.all()
+    queryset: QuerySet[M] = rows if isinstance(rows, QuerySet) else rows._default_manager.all()
     try:
         return queryset.get(**lookup)
-    except queryset.model.DoesNotExist:
+    except ObjectDoesNotExist:
         what = queryset.model._meta.verbose_name
         raise Http404(f"There is no {what} {', '.join(str(value) for value in lookup.values())} here.") from None

@@ -132,7 +132,9 @@ def _reach_mm() -> float | None:
 def scan_order(request: SignedIn, pk: int) -> HttpResponse:
     """Order a scan of a tool's regions."""
     tool = _tool(pk)
-    form = ScanOrderForm(request.POST or None, tool=tool, initial={"rig": request.GET.get("rig")} if "rig" in request.GET else {})
+    form = ScanOrderForm(
+        request.POST or None, tool=tool, initial={"rig": request.GET.get("rig")} if "rig" in request.GET else {}
+    )
     if request.method == "POST" and form.is_valid():
         data = form.cleaned_data
         try:

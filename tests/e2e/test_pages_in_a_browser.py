@@ -21,6 +21,13 @@ pytestmark = [
 ]
 
 
+TOO_SMALL = """
+[...document.querySelectorAll("main .button, main select, main input:not([type=checkbox], [type=hidden])")]
+  .filter((one) => one.offsetParent && one.getBoundingClientRect().height < 43.5)
+  .map((one) => one.outerHTML.slice(0, 80))
+"""
+
+
 @pytest.fixture
 def plant() -> dict[str, User]:
     return whole_plant(shape=(160, 90), visits=2)
@@ -48,16 +55,15 @@ def test_every_kind_of_page_draws_and_fits(plant: dict[str, User], live_server: 
         for path in paths:
             who.go(path)
             assert who.fits(), path
-            small = who.page.evaluate(
-                "[...document.querySelectorAll('main .button, main select, main input:not([type=checkbox],[type=hidden])')]"
-                ".filter(e => e.offsetParent && e.getBoundingClientRect().height < 43.5).map(e => e.outerHTML.slice(0, 80))"
-            )
+            small = who.page.evaluate(TOO_SMALL)
             assert small == [], (path, "too small for a gloved finger")
         assert who.complaints == []
 
 
 def test_a_range_image_is_drawn_cut_zoomed_and_turned(plant: dict[str, User], live_server: Any) -> None:
-    done = Scan.objects.filter(region__tool__code="K-114", region__name="R3", state=ScanState.DONE).latest("finished_at")
+    done = Scan.objects.filter(region__tool__code="K-114", region__name="R3", state=ScanState.DONE).latest(
+        "finished_at"
+    )
     with visitor(live_server.url) as who:
         page = signed_in(who).go(done.get_absolute_url())
         who.wait_for_surface()
@@ -85,7 +91,9 @@ def test_the_trend_shows_every_region_and_changes_its_metric(plant: dict[str, Us
     with visitor(live_server.url) as who:
         page = signed_in(who).go(tool.get_absolute_url())
         page.locator("#trend[data-drawn]").wait_for()
-        names = "[...new Set(document.querySelector('[data-chart]').data.map(t => t.name).filter(Boolean))].sort().join()"
+        names = (
+            "[...new Set(document.querySelector('[data-chart]').data.map(t => t.name).filter(Boolean))].sort().join()"
+        )
         assert page.evaluate(names) == "R1,R2,R3"
         page.locator("[data-metric]").select_option("d_max")
         page.locator("#trend[data-drawn=d_max]").wait_for()

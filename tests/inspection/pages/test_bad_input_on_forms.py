@@ -48,7 +48,15 @@ def test_a_region_outside_the_tool_is_refused(
 
 def test_a_region_beyond_the_stage_is_refused(browse: Browse, knife: Tool) -> None:
     Rig.objects.update(travel_mm=40.0)
-    form = {"name": "R4", "start_mm": "39", "length_mm": "5", "row_offset": 0, "rows": 1000, "flat_row": 0, "flat_rows": 600}
+    form = {
+        "name": "R4",
+        "start_mm": "39",
+        "length_mm": "5",
+        "row_offset": 0,
+        "rows": 1000,
+        "flat_row": 0,
+        "flat_rows": 600,
+    }
     answer = browse("erik").post(reverse("region-new", args=[knife.pk]), form)
     assert answer.status_code == 422
     assert "beyond the 40 mm that the longest stage can travel" in answer.content.decode()
@@ -70,7 +78,12 @@ def test_an_order_queues_one_scan_per_chosen_region(browse: Browse, knife: Tool)
     two = list(knife.regions.order_by("name"))[:2]
     answer = browse("olga").post(
         reverse("scan-order", args=[knife.pk]),
-        {"rig": Rig.objects.get().pk, "regions": [r.pk for r in two], "exposures_us": "100;300", "reason": "After collision"},
+        {
+            "rig": Rig.objects.get().pk,
+            "regions": [r.pk for r in two],
+            "exposures_us": "100;300",
+            "reason": "After collision",
+        },
     )
     visit = Inspection.objects.get()
     assert answer["Location"] == visit.get_absolute_url()
@@ -178,7 +191,7 @@ def test_a_broken_stack_is_one_sentence_and_leaves_nothing(
     region = knife.regions.get(name="R2")
     uploads = [SimpleUploadedFile(name, content) for name, content in files]
     answer = browse("olga").post(
-        reverse("import"), {"region": region.pk, "rig": Rig.objects.get().pk, "files": uploads}
+        reverse("import"), {"region": region.pk, "rig": Rig.objects.get().pk, "stack": uploads}
     )
     assert answer.status_code == 422
     text = answer.content.decode()

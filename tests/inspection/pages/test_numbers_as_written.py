@@ -44,19 +44,30 @@ def test_units_are_written_as_people_write_them() -> None:
     assert with_units("Depth is 239 um in 0.07 mm3; the sum stays") == "Depth is 239 µm in 0.07 mm³; the sum stays"
 
 
-@pytest.mark.parametrize(("share", "text"), [(0.0, "0.0 %"), (2e-6, "below 0.01 %"), (0.0042, "0.42 %"), (0.25, "25 %")])
+@pytest.mark.parametrize(
+    ("share", "text"), [(0.0, "0.0 %"), (2e-6, "below 0.01 %"), (0.0042, "0.42 %"), (0.25, "25 %")]
+)
 def test_small_shares_do_not_become_zero(share: float, text: str) -> None:
     assert percent(share) == text
 
 
-@pytest.mark.parametrize(("seconds", "text"), [(42, "42 s"), (190, "3 min 10 s"), (1500, "25 min"), (7500, "2 h 05 min")])
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(42, "42 s"), (190, "3 min 10 s"), (1500, "25 min"), (7500, "2 h 05 min")]
+)
 def test_durations_read_aloud(seconds: float, text: str) -> None:
     assert duration(seconds) == text
 
 
 @pytest.mark.parametrize(
     ("seconds", "text"),
-    [(10, "now"), (200, "3 min ago"), (7300, "2 h ago"), (86400, "1 day ago"), (5 * 86400, "5 days ago"), (-600, "in 10 min")],
+    [
+        (10, "now"),
+        (200, "3 min ago"),
+        (7300, "2 h ago"),
+        (86400, "1 day ago"),
+        (5 * 86400, "5 days ago"),
+        (-600, "in 10 min"),
+    ],
 )
 def test_moments_are_told_from_now(seconds: int, text: str) -> None:
     now = timezone.now()
