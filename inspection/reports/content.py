@@ -55,7 +55,7 @@ def inspection_content(inspection: Inspection) -> tuple[Json, dt.datetime]:
         "inspection": str(inspection.pk),
         "tool": tool.code,
         "verdict": verdict,
-        "action": ACTIONS[Verdict(verdict)],
+        "action": _action(verdict, [result.verdict if (result := results[scan.pk]) else None for scan in scans]),
         "date": _day(inspection.requested_at),
         "facts": [
             ["Tool", tool.code],
@@ -83,6 +83,13 @@ def inspection_content(inspection: Inspection) -> tuple[Json, dt.datetime]:
         "font_note": "",
     }
     return content, as_of
+
+
+def _action(verdict: str, of_regions: Sequence[str | None]) -> str:
+    """What to do. Where a region has no verdict, "keep in service" would promise what nobody has seen."""
+    if verdict == Verdict.WATCH and any(one in (None, Verdict.UNKNOWN) for one in of_regions):
+        return "Scan again now: at least one region has no verdict."
+    return ACTIONS[Verdict(verdict)]
 
 
 def _newest(scan: Scan) -> RangeImage | None:

@@ -96,7 +96,7 @@ def recipe() -> Recipe:
 
 
 def surface(shape: tuple[int, int], chips: list[tuple[float, float, float, float]], seed: int = 7) -> np.ndarray:
-    """A tilted, noisy bevel in um with Gaussian chips (row, profile, radius, depth_um), a lost strip and stray holes."""
+    """A tilted, noisy bevel in um with Gaussian chips (row, profile, radius, depth_um), a lost strip, holes."""
     rng = np.random.default_rng(seed)
     rows, profiles = np.mgrid[0 : shape[0], 0 : shape[1]]
     height = 900 + 0.35 * rows - 0.05 * profiles + rng.normal(0, 4.2, shape)

@@ -35,11 +35,14 @@ def last() -> Inspection:
 def test_it_says_the_verdict_and_what_it_rests_on(last):
     text = words(inspection_pdf(last))
     for expected in [
-        "Tool K-114", "REPLACE", "Take out of service", "Chipping knife", "Chipper 2, pocket 5", "by Olga", "Weekly check",
+        "Tool K-114",
+        "REPLACE", "Take out of service", "Chipping knife", "Chipper 2, pocket 5", "by Olga", "Weekly check",
         "Greatest depth 214 µm is above the replace limit of 150 µm.", "Region R1", "Region R2", "Region R3",
-        "0.0310 ± 0.0032", "0.1420 ± 0.0082", "mm³", "not measured", "k = 2", "medium", "large", "6.35 %", "4.21 µm in a cell of",
+        "0.0310 ± 0.0032", "0.1420 ± 0.0082", "mm³", "not measured", "k = 2", "medium", "large", "6.35 %",
+        "4.21 µm in a cell of",
         "7.15 × 41.65 µm", "Missing volume (V-)", "version 1", "First limits", "Step gauge SG-7, certificate 4711",
-        "0.0142374 mm/px", "1.58 %", "4 May 2027", "HDRE-I", "sliding", "edgewatch 0.1.0", "Inspected by", "Released by",
+        "0.0142374 mm/px", "1.58 %", "4 May 2027", "HDRE-I", "sliding", "edgewatch 0.1.0",
+        "Inspected by", "Released by",
         "Page 1 of", "R3 Greatest depth is 214 µm: the replace limit of 150 µm is already passed.",
     ]:  # fmt: skip
         assert expected in text, expected
@@ -83,6 +86,14 @@ def test_a_visit_with_a_hole_in_it_says_so_and_is_not_ok():
     assert "the scan is failed: The camera sent no frame within 2 s at step 17" in text
     assert "Not measured: the scan is cancelled." in text
     assert "Keep in service." not in text
+
+
+def test_watch_with_a_region_missing_does_not_say_keep_it_in_service():
+    visit = plant.visit(plant.knife(), 0, states={"R1": ScanState.FAILED, "R3": ScanState.CANCELLED})
+    text = words(inspection_pdf(visit))
+    assert "WATCH" in text
+    assert "Scan again now: at least one region has no verdict." in text
+    assert "Keep in service" not in text
 
 
 @pytest.mark.parametrize("state", [ScanState.QUEUED, ScanState.RUNNING, ScanState.INTERRUPTED])
@@ -155,8 +166,10 @@ def test_the_report_is_downloaded_by_whoever_may_look(client, last):
 @pytest.mark.parametrize(
     ("value", "u", "shown"),
     [
-        (214.0, 4.4, "214.0 ± 8.8"), (0.0314159, 0.0016, "0.0314 ± 0.0032"), (12345.6, 123.0, "12350 ± 250"), (5.0, None, "5"),
-        (None, 1.0, "not measured"), (float("nan"), 1.0, "not measured"), (0.0, 0.5, "0.0 ± 1.0"), (3.14159, 0.0, "3.142"),
+        (214.0, 4.4, "214.0 ± 8.8"), (0.0314159, 0.0016, "0.0314 ± 0.0032"), (12345.6, 123.0, "12350 ± 250"),
+        (5.0, None, "5"),
+        (None, 1.0, "not measured"), (float("nan"), 1.0, "not measured"), (0.0, 0.5, "0.0 ± 1.0"),
+        (3.14159, 0.0, "3.142"),
         (-0.5, 0.021, "-0.500 ± 0.042"),
     ],
 )  # fmt: skip
