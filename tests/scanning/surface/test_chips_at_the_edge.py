@@ -90,7 +90,9 @@ def test_an_edge_along_the_laser_line_is_measured_by_turning_the_axes():
     straight = inspect_surface(image)
     report = inspect_surface(turned, settings=InspectionSettings(edge_axis=0))
     assert report.residual_um.shape == turned.height_um.shape
-    assert [one.volume_mm3 for one in report.damages] == [one.volume_mm3 for one in straight.damages]
+    # Not bit for bit: what the tilted camera cannot have seen is judged along the scan only.
+    volumes = [one.volume_mm3 for one in straight.damages]
+    assert [one.volume_mm3 for one in report.damages] == pytest.approx(volumes, rel=0.01)
     for found in report.damages:
         rows, profiles = slice(*found.rows), slice(*found.profiles)
         assert np.count_nonzero(report.damage_labels[rows, profiles] == found.number) == found.pixels
