@@ -64,8 +64,10 @@ class StackWriter:
             raise BadInput(
                 f"{self.part} cannot be written ({reason(error)}); check the folder, its rights and the disk"
             ) from error
-        self._file.attrs["format"] = STORE_FORMAT
-        self._file.attrs["header"] = json.dumps(header_to_json(header), sort_keys=True, allow_nan=False)
+        # Fixed-length bytes lie in the checksummed head; variable-length text lies in a heap without checksum, and the
+        # library never returns from a damaged one.
+        self._file.attrs["format"] = np.bytes_(STORE_FORMAT)
+        self._file.attrs["header"] = np.bytes_(json.dumps(header_to_json(header), sort_keys=True, allow_nan=False))
         self._frames = self._file.create_dataset(
             "frames",
             shape=(0, bracket, *frame),
@@ -127,7 +129,7 @@ class StackWriter:
             self._file = None
             with h5py.File(self.part, "r+", libver=("v110", "v110")) as file:
                 file.attrs["steps"] = self.steps_written
-                file.attrs["sha256"] = self._identity.sha256(done)
+                file.attrs["sha256"] = np.bytes_(self._identity.sha256(done))
                 file.attrs["complete"] = True
             descriptor = os.open(self.part, os.O_RDWR)
             try:
@@ -172,7 +174,7 @@ class StoredStack:
         self._header = header
         self._frames: Any = file["frames"]
         self._crc32: Any = file["crc32"][: header.steps]
-        self._sha256 = str(file.attrs["sha256"]) if complete else None
+        self._sha256 = bytes(file.attrs["sha256"]).decode("ascii") if complete else None
         self.intended = intended
         self.partial = not complete or 0 < header.steps < intended
 
@@ -196,13 +198,14 @@ class StoredStack:
 
     @classmethod
     def _checked(cls, path: Path, file: h5py.File) -> StoredStack:
-        found = file.attrs.get("format")
+        stored = file.attrs.get("format")
+        found = stored.decode("utf-8", "replace") if isinstance(stored, bytes) else stored
         if found != STORE_FORMAT:
             raise BadInput(
                 f"{path} is an HDF5 file but no stack of this version (format {found!r}, expected {STORE_FORMAT!r}); "
                 "give one recorded or imported here"
             )
-        told = json.loads(file.attrs["header"])
+        told = json.loads(bytes(file.attrs["header"]))
         intended = int(told["steps"])
         complete = bool(file.attrs.get("complete", False))
         frames: Any = file["frames"]
