@@ -43,7 +43,7 @@ def envlist(name: str, default: list[str]) -> list[str]:
 
 
 def secret(name: str, file: Path) -> str:
-    """Return the secret from the environment, or the one kept in ``file``, made on first use and readable by us only."""
+    """Return the secret from the environment, or the one kept in ``file``, made on first use, for our eyes only."""
     if value := os.environ.get(name):
         return value
     try:

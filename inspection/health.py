@@ -1,7 +1,7 @@
 """Whether this installation works, for machines: one JSON answer at ``/health/``.
 
-A process id proves nothing (a worker can be alive and deaf), so the signs looked at are work done: the database answers,
-the doorbell answers, each rig's worker has shown itself lately, the disk has room.
+A process id proves nothing (a worker can be alive and deaf), so the signs looked at are work done: the database
+answers, the doorbell answers, each rig's worker has shown itself lately, the disk has room.
 """
 
 from __future__ import annotations
@@ -57,7 +57,9 @@ def signs() -> list[Sign]:
         else:
             age = now - seen
             found.append(
-                Sign(f"rig {rig.slug}", age < WORKER_SILENT, f"{rig.name}: worker seen {age.total_seconds():.0f} s ago.")
+                Sign(
+                    f"rig {rig.slug}", age < WORKER_SILENT, f"{rig.name}: worker seen {age.total_seconds():.0f} s ago."
+                )
             )
     return found
 

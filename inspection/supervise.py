@@ -71,10 +71,8 @@ class Child:
             return
         if self.process.poll() is None:
             self.process.terminate()
-            try:
+            with contextlib.suppress(subprocess.TimeoutExpired):
                 self.process.wait(self.grace_s)
-            except subprocess.TimeoutExpired:
-                pass
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self.process.pid, signal.SIGKILL)
         with contextlib.suppress(subprocess.TimeoutExpired):
@@ -114,8 +112,8 @@ class Supervisor:
                 child.wait_s = 1.0 if lived > SETTLED_S else min(child.wait_s * 2, LONGEST_WAIT_S)
                 child.not_before = now + child.wait_s
                 self._say(
-                    f"{child.name} stopped (exit {child.process.returncode}); starting it again in {child.wait_s:.0f} s."
-                    f" Its log: {child.log}"
+                    f"{child.name} stopped (exit {child.process.returncode}); starting it again in {child.wait_s:.0f} s. "
+                    f"Its log: {child.log}"
                 )
                 with contextlib.suppress(ProcessLookupError, PermissionError):
                     os.killpg(child.process.pid, signal.SIGKILL)

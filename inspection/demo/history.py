@@ -41,10 +41,9 @@ def make_history(
     for visit in range(VISITS):
         share = visit / (VISITS - 1)
         at = since + share * (yesterday - since)
-        tool.life_used = round(hours * share, 1)
-        tool.save(update_fields=["life_used"])
+        used = round(hours * share, 1)
         inspection = Inspection.objects.create(
-            tool=tool, requested_by=by, requested_at=at, reason="Demo history (simulated surfaces)", life_used=tool.life_used
+            tool=tool, requested_by=by, requested_at=at, reason="Demo history (simulated surfaces)", life_used=used
         )
         for number, region in enumerate(tool.regions.filter(active=True)):
             started = at + dt.timedelta(minutes=2 * number)
@@ -56,9 +55,7 @@ def make_history(
                 plan=plan_for(region, rig, exposures, recipe), recipe=recipe,
                 calibration=rig.calibration_now(), limit_set=limits_in_force(tool),
             )  # fmt: skip
-            image = simulated_range_image(
-                region.name, tool.code, visit, RECESSION_UM_PER_HOUR * tool.life_used, rows=region.rows
-            )
+            image = simulated_range_image(region.name, tool.code, visit, RECESSION_UM_PER_HOUR * used, rows=region.rows)
             first = region.flat_row
             record_result(
                 scan,
@@ -74,8 +71,8 @@ def simulated_range_image(
 ) -> scanning.range_image.RangeImage:
     """The surface of a knife's region at some wear, seen with the demo rig's noise. R1..R3 keep their damages."""
     seed = zlib.crc32(code.encode()) % 1_000_000
-    # Damage happens at some moment: the first visit finds a sound edge everywhere.
-    damages = () if visit == 0 or code != "KN-07" else None
+    # Damage happens at some moment: only the last earlier visit of the demo knife finds some.
+    damages = None if visit == VISITS - 1 and code == "KN-07" else ()
     truth = scene(region, seed=seed, wear_um=wear_um, visit=visit + 1, damages=damages).truth(rows=rows, steps=245)
     height = truth.height_um[:, 2:-2]
     rng = np.random.default_rng((seed, visit, zlib.crc32(region.encode())))

@@ -21,7 +21,7 @@ from django.utils import timezone
 
 from inspection.demo.gauge import gauge_pairs
 from inspection.demo.history import make_history
-from inspection.models import Calibration, Rig, Role, Schedule, Tool, ToolType, User
+from inspection.models import Calibration, Rig, Role, Scan, Schedule, Tool, ToolType, User
 from inspection.services.calibrations import add_calibration
 from inspection.services.plant import create_tool, create_tool_type, record_event
 from inspection.services.schedules import save_schedule
@@ -65,8 +65,11 @@ def rig_config(speed_up: float) -> dict[str, Any]:
     }
 
 
-def make_demo_plant(say: Callable[[str], None], *, speed_up: float = 20.0, history: bool = True) -> DemoPlant:
-    """Make what is not there yet and return the plant. A second call changes nothing but the rig's speed-up."""
+def make_demo_plant(say: Callable[[str], None], *, speed_up: float = 20.0) -> DemoPlant:
+    """Make what is not there yet and return the plant. A second call changes nothing but the rig's speed-up.
+
+    The knives' earlier visits take a minute of computing and are left to `make_histories`.
+    """
     passwords = make_people()
     engineer = User.objects.filter(username="erik").first()
     rig, fresh = Rig.objects.get_or_create(
@@ -85,7 +88,7 @@ def make_demo_plant(say: Callable[[str], None], *, speed_up: float = 20.0, histo
     if not rig.calibrations.exists():
         say("Calibrating the demo rig on its simulated step gauge ...")
         calibrate(rig, engineer)
-    tool = make_knives(rig, engineer, say, history=history)
+    tool = make_knives(rig, engineer)
     return DemoPlant(rig, tool, passwords)
 
 
@@ -114,7 +117,18 @@ def calibrate(rig: Rig, by: User | None) -> Calibration:
     )
 
 
-def make_knives(rig: Rig, by: User | None, say: Callable[[str], None], *, history: bool) -> Tool:
+def make_histories(say: Callable[[str], None]) -> None:
+    """Add the earlier visits of the demo knives that were used and have none."""
+    rig = Rig.objects.get(slug=DEMO_RIG)
+    engineer = User.objects.filter(username="erik").first()
+    for code, (_, hours) in KNIVES.items():
+        tool = Tool.objects.get(code=code)
+        if hours and not Scan.objects.filter(region__tool=tool, source=Scan.Source.IMPORT).exists():
+            installed = tool.events.filter(kind="installed").earliest("at").at
+            make_history(tool, rig, hours=hours, since=installed, by=engineer, say=say)
+
+
+def make_knives(rig: Rig, by: User | None) -> Tool:
     kind = ToolType.objects.filter(name="Chipping knife 55°").first()
     if kind is None:
         kind = create_tool_type(by=by, name="Chipping knife 55°", edge_length_mm=60.0, bevel_angle_deg=55.0)
@@ -122,14 +136,12 @@ def make_knives(rig: Rig, by: User | None, say: Callable[[str], None], *, histor
     for number, (code, (location, hours)) in enumerate(KNIVES.items()):
         if Tool.objects.filter(code=code).exists():
             continue
-        tool = create_tool(by=by, code=code, tool_type=kind, location=location, life_used=0.0)
+        tool = create_tool(by=by, code=code, tool_type=kind, location=location, life_used=hours)
         if number == 2:
             tool.status = Tool.Status.SPARE
             tool.save(update_fields=["status"])
         installed = timezone.now() - dt.timedelta(days=30)
         record_event(tool=tool, kind="installed", at=installed, by=by, note="Ground edge, new in the pocket.")
-        if history and hours:
-            make_history(tool, rig, hours=hours, since=installed, by=by, say=say)
         if number < 2:
             save_schedule(
                 by=by, tool=tool, rig=rig, every=1, unit=Schedule.Unit.WEEKS,

@@ -10,6 +10,26 @@ from inspection.models.schedules import DueSlot, Schedule
 from inspection.models.tokens import ApiToken
 
 __all__ = [
-    "ApiToken", "AuditEvent", "Calibration", "Damage", "DueSlot", "Event", "Inspection", "Limit", "LimitSet", "Measurement",
-    "PrecisionReport", "RangeImage", "Recipe", "Recomputation", "Region", "Rig", "Role", "Scan", "Schedule", "Tool", "ToolType", "User",
-]  # fmt: skip
+    "ApiToken",
+    "AuditEvent",
+    "Calibration",
+    "Damage",
+    "DueSlot",
+    "Event",
+    "Inspection",
+    "Limit",
+    "LimitSet",
+    "Measurement",
+    "PrecisionReport",
+    "RangeImage",
+    "Recipe",
+    "Recomputation",
+    "Region",
+    "Rig",
+    "Role",
+    "Scan",
+    "Schedule",
+    "Tool",
+    "ToolType",
+    "User",
+]

@@ -35,7 +35,9 @@ class Rig(models.Model):
     )
     queue_since = models.DateTimeField(null=True, blank=True)
     pause_under_lock = models.CharField(
-        max_length=300, blank=True, help_text="Why the queue was paused before the rig was locked; unlocking brings it back."
+        max_length=300,
+        blank=True,
+        help_text="Why the queue was paused before the rig was locked; unlocking brings it back.",
     )
     worker_seen_at = models.DateTimeField(null=True, blank=True)
 

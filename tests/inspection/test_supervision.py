@@ -64,7 +64,7 @@ def test_a_child_that_keeps_dying_waits_longer_each_time(tmp_path: Path) -> None
 
 
 def test_stopping_ends_children_in_reverse_order_and_kills_the_deaf(tmp_path: Path) -> None:
-    deaf = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('deaf', flush=True); time.sleep(600)"
+    deaf = "import signal as s, time; s.signal(s.SIGTERM, s.SIG_IGN); print('deaf', flush=True); time.sleep(600)"
     supervisor = Supervisor(lambda text: None)
     polite = supervisor.start(Child("polite", FOREVER, tmp_path / "polite"))
     stubborn = supervisor.start(Child("stubborn", [sys.executable, "-c", deaf], tmp_path / "deaf", grace_s=0.2))

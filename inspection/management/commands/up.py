@@ -33,11 +33,16 @@ class Command(BaseCommand):
     help = "Start everything, scan the demo knife, and stay up until Ctrl-C (--once: stop after the scan)."
 
     def add_arguments(self, parser: CommandParser) -> None:
-        parser.add_argument("--once", action="store_true", help="Stop everything after the demo knife; exit 0 if measured.")
+        parser.add_argument(
+            "--once", action="store_true", help="Stop everything after the demo knife; exit 0 if measured."
+        )
         parser.add_argument("--port", type=int, default=8000, help="Port of the web server (default 8000).")
         parser.add_argument("--host", default="127.0.0.1", help="Address to listen on; 0.0.0.0 lets tablets in.")
         parser.add_argument("--no-demo-scan", action="store_true", help="Do not scan the demo knife.")
-        parser.add_argument("--speed-up", type=float, default=20.0, help="How much faster than life the simulated rig runs.")
+        parser.add_argument("--no-history", action="store_true", help="Make the demo knives without earlier visits.")
+        parser.add_argument(
+            "--speed-up", type=float, default=20.0, help="How much faster than life the simulated rig runs."
+        )
 
     def handle(self, *args: Any, **options: Any) -> None:
         raise_on_signals()
@@ -82,6 +87,17 @@ class Command(BaseCommand):
                 self.say(f"    {name:<8} {role:<9} {password}")
         self.wait_for(web, f"http://{'127.0.0.1' if options['host'] == '0.0.0.0' else options['host']}:{port}/health/")
 
+        history = None
+        if not options["no_history"]:
+            # Beside the scan, not before it: surfaces of a dozen earlier visits take a minute to measure.
+            history = self.supervisor.start(
+                Child(
+                    "history of the demo knives",
+                    [sys.executable, "manage.py", "demo", "--histories"],
+                    self.logs / "history.log",
+                    restart=False,
+                )
+            )
         measured = True
         if not options["no_demo_scan"]:
             measured = self.scan_demo_knife(plant)
@@ -89,6 +105,8 @@ class Command(BaseCommand):
         if options["once"]:
             if not measured:
                 raise CommandError("Not all regions of the demo knife were measured; see the sentences above.")
+            if history is not None:
+                self.wait_until_ended(history)
             self.say(f"All regions measured. (The pages were at {address})")
             return
         self.say(f"Edgewatch is up: {address}   (Ctrl-C stops everything; logs in {self.logs})")
@@ -184,11 +202,20 @@ class Command(BaseCommand):
             self.give_up_if_dead(child, deadline)
             time.sleep(0.2)
 
+    def wait_until_ended(self, child: Child) -> None:
+        while child.running:
+            self.supervisor.watch()
+            time.sleep(0.2)
+        if child.process is not None and child.process.returncode:
+            raise CommandError(f"The {child.name} failed. Its last words:\n{child.last_lines()}")
+
     def give_up_if_dead(self, child: Child, deadline: float) -> None:
         if not child.running:
             raise CommandError(f"{child.name} did not start. Its last words:\n{child.last_lines()}")
         if time.monotonic() > deadline:
-            raise CommandError(f"{child.name} did not answer within {READY_S:.0f} s. Its last words:\n{child.last_lines()}")
+            raise CommandError(
+                f"{child.name} did not answer within {READY_S:.0f} s. Its last words:\n{child.last_lines()}"
+            )
 
     # -- the demo knife ------------------------------------------------------------------------------------------
 
@@ -196,7 +223,9 @@ class Command(BaseCommand):
         from inspection.demo.scan import follow, order_demo_scan, table
 
         inspection = order_demo_scan(plant)
-        self.say(f"Scanning {plant.tool.code}: regions {', '.join(r.name for r in plant.tool.regions.filter(active=True))}")
+        self.say(
+            f"Scanning {plant.tool.code}: regions {', '.join(r.name for r in plant.tool.regions.filter(active=True))}"
+        )
         scans = follow(inspection, self.say, tick=self.supervisor.watch)
         self.stdout.write("")
         for line in table(scans):
