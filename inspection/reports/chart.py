@@ -36,7 +36,7 @@ def draw_trend(trends: Sequence[dict[str, Any]], width: float = 84.0, height: fl
         if (bound := (limits or {}).get(name)) is not None
     ]
     first, last = min(t for t, _ in points), max(t for t, _ in points)
-    span = max((last - first).total_seconds(), 86400.0)
+    span = max((last - first).total_seconds(), 4 * 86400.0)
     begin, end = first - dt.timedelta(seconds=0.04 * span), last + dt.timedelta(seconds=0.14 * span)
     top_value = max([v for _, v in points] + [lim for lim, _, _ in lines])
     bottom_value = min([v for _, v in points] + [0.0])

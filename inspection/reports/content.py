@@ -251,9 +251,17 @@ def _flat(value: Any, prefix: str = "") -> list[list[str]]:
     if isinstance(value, dict):
         return [row for key, inner in value.items() for row in _flat(inner, f"{prefix}{key} ")]
     if isinstance(value, list) and any(isinstance(inner, dict | list) for inner in value):
-        return [row for i, inner in enumerate(value, 1) for row in _flat(inner, f"{prefix}{i} ")]
+        return [row for i, inner in enumerate(value, 1) for row in _flat(*_step(i, inner))]
     shown = ", ".join(str(inner) for inner in value) if isinstance(value, list) else str(value)
-    return [[prefix.strip(), shown]]
+    return [[prefix.strip(), "not set" if value is None else shown]]
+
+
+def _step(i: int, inner: Any) -> tuple[Any, str]:
+    """A step of a recipe with its number and name as the path: ``3 sci``."""
+    if isinstance(inner, dict) and "operation" in inner:
+        rest = {key: value for key, value in inner.items() if key != "operation"}
+        return rest or "no parameters", f"{i} {inner['operation']} "
+    return inner, f"{i} "
 
 
 def _hashes(scan: Scan, result: RangeImage | None) -> list[str]:
@@ -263,9 +271,8 @@ def _hashes(scan: Scan, result: RangeImage | None) -> list[str]:
 def _software(found: Sequence[RangeImage]) -> list[list[str]]:
     versions: dict[str, str] = {}
     for result in found:
-        software = result.provenance.get("software") or {}
-        items = software.items() if isinstance(software, dict) else [("software", software)]
-        versions |= {str(name): str(version) for name, version in items}
+        software = result.provenance.get("versions") or {}
+        versions |= {str(name): str(version) for name, version in software.items()}
     return [[name, version] for name, version in versions.items()]
 
 

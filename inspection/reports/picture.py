@@ -37,6 +37,7 @@ class Outline:
     number: int
     rows: tuple[float, float]
     profiles: tuple[float, float]
+    depth_um: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ def outlines(damages: Sequence[Any]) -> list[Outline]:
     for damage in damages:
         rows, profiles = damage.detail.get("rows"), damage.detail.get("profiles")
         if rows and profiles:
-            found.append(Outline(damage.number, (rows[0], rows[1]), (profiles[0], profiles[1])))
+            found.append(Outline(damage.number, (rows[0], rows[1]), (profiles[0], profiles[1]), damage.depth_um))
     return found
 
 
@@ -80,7 +81,7 @@ def draw(image: RangeImage, damages: Sequence[Outline], *, start_mm: float = 0.0
     scale = min(WIDE / across, TALL / down)
     w, h = max(across * scale, LEAST_SIDE), max(down * scale, LEAST_SIDE)
     equal = abs(w / across - h / down) < 0.02 * scale
-    low, high = colour_range(height)
+    low, high = colour_range(height, max((damage.depth_um for damage in damages), default=0.0))
     left, top, right, bottom = 9.5, 1.5, 17.0, 8.5
     paper = Drawing(left + w + right, top + h + bottom)
     paper.picture(left, top, w, h, png(height, low, high, (round(w * DOTS_PER_MM), round(h * DOTS_PER_MM))))
@@ -117,6 +118,10 @@ def draw(image: RangeImage, damages: Sequence[Outline], *, start_mm: float = 0.0
     paper.text(left + w + right - 1, top + h / 2, "height, µm", anchor="middle", turn=-90, colour=INK)
     share = 100.0 * image.undefined_share
     caption = f"{how} Hatched grey: not measured ({share:.1f} %)."
+    finite = height[np.isfinite(height)]
+    beyond = np.count_nonzero((finite < low) | (finite > high)) / finite.size if finite.size else 0.0
+    if beyond > 0.005:
+        caption += f" {100 * beyond:.1f} % lie beyond the colour bar and take its end colour."
     if not equal:
         caption += " The two axes are not to the same scale."
     alt = (
@@ -126,15 +131,23 @@ def draw(image: RangeImage, damages: Sequence[Outline], *, start_mm: float = 0.0
     return Picture(paper.svg(), paper.width, paper.height, alt, caption)
 
 
-def colour_range(height_um: Float32) -> tuple[float, float]:
-    """The heights at the two ends of the colours: nearly all of them, and never less than 50 um apart."""
+def colour_range(height_um: Float32, deepest_um: float = 0.0) -> tuple[float, float]:
+    """The heights at the two ends of the colours, never less than 50 um apart.
+
+    They span the noise and the deepest damage; a few wild pixels, hundreds of um off where the detector took a wrong
+    peak, would otherwise leave one colour for everything real.
+    """
     finite = height_um[np.isfinite(height_um)]
     if not finite.size:
         return -LEAST_SPAN_UM / 2, LEAST_SPAN_UM / 2
-    low, high = (float(value) for value in np.percentile(finite, [0.05, 99.8]))
+    lowest, middle, highest = (float(value) for value in np.percentile(finite, [0.05, 50, 99.8]))
+    noise = 1.4826 * float(np.median(np.abs(finite - middle)))
+    reach = max(LEAST_SPAN_UM / 2, 8 * noise)
+    low = max(lowest, middle - max(reach, 1.1 * deepest_um))
+    high = min(highest, middle + reach)
     if high - low < LEAST_SPAN_UM:
-        middle = (low + high) / 2
-        low, high = middle - LEAST_SPAN_UM / 2, middle + LEAST_SPAN_UM / 2
+        centre = (low + high) / 2
+        low, high = centre - LEAST_SPAN_UM / 2, centre + LEAST_SPAN_UM / 2
     return low, high
 
 

@@ -88,7 +88,10 @@ def rig() -> Rig:
 
 
 def recipe() -> Recipe:
-    definition = {"name": "HDRE-I", "operations": [{"op": "sci", "mode": "sliding", "images": 5}, {"op": "hdre"}]}
+    definition = {
+        "name": "HDRE-I",
+        "operations": [{"operation": "sci", "mode": "sliding", "images": 5}, {"operation": "hdre"}],
+    }
     found, _ = Recipe.objects.get_or_create(
         sha256=hashlib.sha256(b"HDRE-I").hexdigest(), defaults={"name": "HDRE-I", "definition": definition}
     )
@@ -207,7 +210,7 @@ def result(
         profiles=shape[1],
         row_pitch_um=7.150838,
         profile_pitch_um=41.65,
-        provenance={"software": {"edgewatch": "0.1.0", "numpy": "2.4.1"}, "recipe": scan.recipe.definition},
+        provenance={"versions": {"edgewatch": "0.1.0", "numpy": "2.4.1"}, "recipe": scan.recipe.definition},
         surface={"warnings": []},
         verdict=verdict,
         verdict_reasons=reasons,

@@ -13,7 +13,7 @@ from inspection.models import Inspection, Role, Tool
 from inspection.reports.content import inspection_content
 from inspection.reports.figures import plain, with_uncertainty
 from inspection.reports.pdf import compiled, inspection_pdf
-from inspection.reports.picture import Outline, draw
+from inspection.reports.picture import Outline, colour_range, draw
 from inspection.states import ScanState
 from scanning.range_image import RangeImage
 from tests.inspection.reports import plant
@@ -205,3 +205,21 @@ def test_an_image_without_any_height_is_drawn_as_nothing_measured():
     drawn = draw(as_image(np.full((50, 40), np.nan, np.float32)), [])
     assert "Nothing was measured" in drawn.caption
     assert "100.0 %" in drawn.alt
+
+
+def test_a_few_wild_pixels_do_not_take_the_colours_from_everything_real():
+    rng = np.random.default_rng(0)
+    height = rng.normal(0, 5, (200, 50)).astype(np.float32)
+    height[:10] = 1500
+    low, high = colour_range(height, deepest_um=90)
+    assert high < 60
+    assert low > -120
+    assert "beyond the colour bar" in draw(as_image(height), []).caption
+
+
+def test_the_colours_reach_the_deepest_damage_and_never_dramatise_noise():
+    rng = np.random.default_rng(0)
+    sound = rng.normal(0, 1, (200, 50)).astype(np.float32)
+    assert np.ptp(colour_range(sound)) == pytest.approx(50, abs=0.01)
+    sound[50:60, 20:30] = -214
+    assert colour_range(sound, deepest_um=214)[0] == pytest.approx(-214, abs=1)
