@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import fcntl
 import os
 import signal
 import subprocess
@@ -18,6 +19,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TextIO
 
 PR_SET_PDEATHSIG = 1
 
@@ -127,11 +129,29 @@ class Supervisor:
             child.stop()
 
 
+def hold_alone(home: Path) -> TextIO | None:
+    """Take the lock of an installation, held until the returned file is closed; None if another process holds it.
+
+    Two sets of workers on one home would drive one rig. The kernel drops the lock with its holder, however it ends.
+    """
+    home.mkdir(parents=True, exist_ok=True)
+    lock = (home / "up.lock").open("w")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        lock.close()
+        return None
+    return lock
+
+
 def raise_on_signals() -> None:
-    """Turn SIGTERM and SIGHUP into KeyboardInterrupt, so that ``finally`` stops the children whichever came."""
+    """Turn SIGINT, SIGTERM and SIGHUP into KeyboardInterrupt, so that ``finally`` stops the children whichever came.
+
+    SIGINT too: a shell that starts a command in the background has it ignored, and Python then leaves it so.
+    """
 
     def interrupt(signum: int, _frame: object) -> None:
         raise KeyboardInterrupt
 
-    signal.signal(signal.SIGTERM, interrupt)
-    signal.signal(signal.SIGHUP, interrupt)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, interrupt)

@@ -116,6 +116,9 @@ class Line:
     gate_px: float = 12.0
     gate_max_px: float = 64.0
     seed: str = "best"
+    candidates: str = "threshold"
+    continuity: str = "nearest"
+    jump: float = 6.0
 
     def __post_init__(self) -> None:
         if self.k is not None:
@@ -134,6 +137,9 @@ class Line:
         _number("msnn.gate_px", self.gate_px, 0.0, 1e6)
         _number("msnn.gate_max_px", self.gate_max_px, self.gate_px, 1e6)
         _choice("msnn.seed", self.seed, ("first", "best"))
+        _choice("msnn.candidates", self.candidates, ("threshold", "noise"))
+        _choice("msnn.continuity", self.continuity, ("nearest", "path"))
+        _number("msnn.jump", self.jump, 0.0, 1000.0)
 
 
 @dataclass(frozen=True)
@@ -384,7 +390,8 @@ _READERS: dict[str, Callable[[str, str], Any]] = {
     "k": _read_float_or_default, "floor": _read_float_or_default, "floor_from": _read_text, "ceiling": _read_float,
     "snr": _read_float_or_default, "grain_px": _read_float_or_default,
     "width_px": _read_float_or_default, "width_factor": _read_float, "gate_px": _read_float,
-    "gate_max_px": _read_float, "seed": _read_text,
+    "gate_max_px": _read_float, "seed": _read_text, "candidates": _read_text, "continuity": _read_text,
+    "jump": _read_float,
 }  # fmt: skip
 
 

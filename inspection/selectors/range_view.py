@@ -120,11 +120,11 @@ def _reference(file: str, written_at: int, stored: tuple[float, ...] | None, pit
     offset, slope_rows, slope_profiles, *quadratic = stored
     y = (np.arange(height.shape[0]) - (height.shape[0] - 1) / 2) * pitches[0] / 1e3
     x = (np.arange(height.shape[1]) - (height.shape[1] - 1) / 2) * pitches[1] / 1e3
-    plane = offset + slope_rows * y[:, None] + slope_profiles * x[None, :]
+    plane: NDArray[np.float64] = offset + slope_rows * y[:, None] + slope_profiles * x[None, :]
     if quadratic:
         yy, xy, xx = quadratic
         plane = plane + yy * y[:, None] ** 2 + xy * y[:, None] * x[None, :] + xx * x[None, :] ** 2
-    return plane.astype(np.float32)
+    return np.asarray(plane, np.float32)
 
 
 def _stored_plane(image: RangeImage) -> tuple[float, ...] | None:

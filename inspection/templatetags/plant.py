@@ -356,3 +356,9 @@ def rule(schedule: Schedule) -> str:
     return (
         f"every {schedule.unit.removesuffix('s')}" if schedule.every == 1 else f"every {schedule.every} {schedule.unit}"
     )
+
+
+@register.filter
+def listed(values: list[float] | None) -> str:
+    """``100, 300, 900``."""
+    return ", ".join(f"{value:g}" for value in values or []) or "none given"

@@ -48,6 +48,7 @@ def scan_page(request: SignedIn, pk: int) -> HttpResponse:
         "result": page.result,
         "progress": progress(scan),
         "channels": CHANNELS,
+        "start_mm": scan.plan.get("start_mm", scan.region.start_mm),
         "fixed_um": _fixed_scale_um(page),
         "recipes": Recipe.objects.all() if scan.has_ended and scan.stack_file else [],
         "siblings": scan.inspection.scans.select_related("region").order_by("region__name", "pk"),

@@ -36,6 +36,8 @@ import numpy as np
 
 from scanning.pipeline.centroid import centre_of_gravity
 from scanning.pipeline.grey import grey
+from scanning.pipeline.path import find_path
+from scanning.pipeline.standing_out import level_and_spread, row_candidates, smooth_row
 
 BLOCK = 64
 """Columns looked at together: a block without a pixel above the threshold is skipped whole."""
@@ -308,16 +310,11 @@ def noise_of(image, top, scale):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def extract_line(  # type: ignore[no-untyped-def]
-    image, top, scale, dark, k, floor, from_row_mean, ceiling, snr, grain_px, expected, factor, gate_px,
-    gate_max_px, best_seed,
-    highest, light, base, shape, height, counts, chosen, column_px, peak, width_px,
+def candidates_by_threshold(  # type: ignore[no-untyped-def]
+    image, top, scale, dark, k, floor, from_row_mean, ceiling, faint, grain_px, highest, light, base, shape, height,
+    counts,
 ):  # fmt: skip
-    """MSNN then COG on one (rows, columns) image of integer codes (see `grey.grey` for top, scale, dark).
-
-    Writes, per row, column_px (px from 0, NaN undefined), peak (light of the line's maximum) and width_px (full width
-    at half maximum, px). ``highest, light, base, shape, height, counts, chosen`` are scratch that keeps its size.
-    """
+    """The peaks of every row above the paper's threshold."""
     rows, columns = image.shape
     row_maxima(image, highest)
     row_light(image, top, scale, dark, light)
@@ -328,7 +325,6 @@ def extract_line(  # type: ignore[no-untyped-def]
         for r in range(rows):
             of_maxima += grey(highest[r], top, scale, dark)
         asked = min(asked, ceiling * (of_maxima / rows))
-    faint = snr * noise_of(image, top, scale) * STRICT if snr > 0.0 else 0.0
     for r in range(rows):
         background = light[r] / columns if from_row_mean else 0.0
         threshold = max(asked, background + floor * (grey(highest[r], top, scale, dark) - background))
@@ -336,7 +332,53 @@ def extract_line(  # type: ignore[no-untyped-def]
         counts[r] = 0
         if min(np.int64(highest[r]), top) >= lowest:
             counts[r] = row_peaks(image[r], lowest, faint, grain_px, top, scale, dark, base[r], shape[r], height[r])
-    find_line(counts, shape, height, expected, factor, gate_px, gate_max_px, best_seed, chosen)
+
+
+@nb.njit(cache=True, nogil=True)
+def candidates_by_noise(  # type: ignore[no-untyped-def]
+    image, top, scale, dark, floor, snr, faint, grain_px, reach, box, three, once, smooth, seen, maxima, base, shape,
+    height, counts,
+):  # fmt: skip
+    """What stands out of the noise in every row; see standing_out.py."""
+    level, spread = level_and_spread(image, box, top, scale, dark, seen)
+    for r in range(image.shape[0]):
+        smooth_row(image, r, box, top, scale, dark, three, once, smooth)
+        counts[r] = row_candidates(
+            image[r], smooth, level, spread, snr, faint, floor, grain_px, reach, box, top, scale, dark, maxima, base[r],
+            shape[r], height[r],
+        )  # fmt: skip
+
+
+@nb.njit(cache=True, nogil=True)
+def extract_line(  # type: ignore[no-untyped-def]
+    image, top, scale, dark, by_noise, by_path, k, floor, from_row_mean, ceiling, snr, grain_px, expected, factor,
+    gate_px, gate_max_px, best_seed, light_width, jump, reach, box,
+    highest, light, base, shape, height, counts, chosen, rows_of, seen, maxima, average, score, back, alive,
+    column_px, peak, width_px,
+):  # fmt: skip
+    """MSNN then COG on one (rows, columns) image of integer codes (see `grey.grey` for top, scale, dark).
+
+    Writes, per row, column_px (px from 0, NaN undefined), peak (light of the line's maximum) and width_px (full width
+    at half maximum, px). What lies between ``box`` and ``column_px`` is scratch that keeps its size.
+    """
+    rows = image.shape[0]
+    faint = snr * noise_of(image, top, scale) * STRICT if snr > 0.0 else 0.0
+    if by_noise:
+        candidates_by_noise(
+            image, top, scale, dark, floor, snr, faint, grain_px, reach, box, rows_of[0], rows_of[1], rows_of[2], seen,
+            maxima, base, shape, height, counts,
+        )  # fmt: skip
+    else:
+        candidates_by_threshold(
+            image, top, scale, dark, k, floor, from_row_mean, ceiling, faint, grain_px, highest, light, base, shape,
+            height, counts,
+        )  # fmt: skip
+    if by_path:
+        find_path(
+            counts, shape, expected, factor, light_width, jump, average, score, back[0], back[1], alive, chosen,
+        )  # fmt: skip
+    else:
+        find_line(counts, shape, height, expected, factor, gate_px, gate_max_px, best_seed, chosen)
     for r in range(rows):
         peak_of_row = chosen[r]
         if peak_of_row < 0:

@@ -23,6 +23,7 @@ from scanning.pipeline.compound import CompoundWindow
 from scanning.pipeline.exposure import exposure_grey, fuse_codes, fuse_sums, look_up
 from scanning.pipeline.grey import DARK_UNIT
 from scanning.pipeline.line import extract_line
+from scanning.pipeline.standing_out import PLACES, box_for
 from scanning.pipeline.tone import GREY_TOP, broadening, fixed_point, grey_bits, light_share, scaled_codes, tone
 from scanning.range_image import RangeImage
 from scanning.recipe import Recipe
@@ -34,6 +35,9 @@ RAW_FLOOR = 0.1
 LOGARITHMIC_FLOOR = 0.6
 RAW_SNR, COMPRESSED_SNR = 4.0, 3.0
 GRAIN_PX = 3.0
+REACH = 3.0
+"""Line widths the base reaches to either side at most."""
+PATHS_ALIVE = 1024
 INT32_TOP = (1 << 31) - 1
 Progress = Callable[[int, int], None]
 Float64 = NDArray[np.float64]
@@ -333,17 +337,22 @@ class _Chain:
             self._grey_level = float(1 << 20)
 
         width = settled.expected_width_px
+        unit = settled.line_width_px if settled.line_width_px is not None else GRAIN_PX
+        box = box_for(width)
         self._line = (
-            settled.k, settled.floor, line.floor_from == "row_mean", line.ceiling, settled.snr,
+            line.candidates == "noise", line.continuity == "path", settled.k, settled.floor, line.floor_from == "row_mean", line.ceiling, settled.snr,
             settled.grain_px,
             1.0 if width is None else width, np.inf if width is None else line.width_factor,
-            line.gate_px, line.gate_max_px, line.seed == "best",
+            line.gate_px, line.gate_max_px, line.seed == "best", unit, line.jump, round(REACH * (width or unit)), box,
         )  # fmt: skip
         most = columns // 2 + 1
-        self._scratch = (  # light, base, shape, height, counts, chosen
+        self._scratch = (  # light, base, shape, height, counts, chosen, and for noise and path: see their files
             np.empty(rows, np.int64),
             np.empty((rows, most, 2), np.int64), np.empty((rows, most, 2)), np.empty((rows, most), np.int64),
             np.zeros(rows, np.int64), np.empty(rows, np.int64),
+            np.empty((3, columns), np.int64), np.empty(PLACES, np.int64), np.empty(most, np.int64),
+            np.empty((rows, most)), np.empty((rows, most)), np.empty((2, rows, most), np.int64),
+            np.empty((PATHS_ALIVE, 2), np.int64),
         )  # fmt: skip
         self._rows = rows
 
@@ -377,7 +386,7 @@ class _Chain:
         return column_px, (peak / self._grey_level).astype(np.float32), width_px.astype(np.float32)
 
     def candidates(self) -> tuple[Float64, Float64]:
-        _, _, shape, _, counts, chosen = self._scratch
+        shape, counts, chosen = self._scratch[2], self._scratch[4], self._scratch[5]
         pairs = [(r, float(shape[r, k, 0]), k == chosen[r]) for r in range(self._rows) for k in range(counts[r])]
         taken = np.array([(r, c) for r, c, is_line in pairs if is_line], dtype=np.float64).reshape(-1, 2)
         rejected = np.array([(r, c) for r, c, is_line in pairs if not is_line], dtype=np.float64).reshape(-1, 2)

@@ -9,7 +9,7 @@ import sys
 import time
 from pathlib import Path
 
-from inspection.supervise import Child, Supervisor
+from inspection.supervise import Child, Supervisor, hold_alone
 
 FOREVER = [sys.executable, "-c", "import time; time.sleep(600)"]
 
@@ -79,7 +79,7 @@ def test_stopping_ends_children_in_reverse_order_and_kills_the_deaf(tmp_path: Pa
 
 def test_children_die_when_the_supervisor_is_killed(tmp_path: Path) -> None:
     script = (
-        "import sys, time; from pathlib import Path; from inspection.supervise import Child, Supervisor\n"
+        "import sys, time; from pathlib import Path; from inspection.supervise import Child, Supervisor, hold_alone\n"
         f"c = Supervisor(print).start(Child('w', {FOREVER!r}, Path({str(tmp_path / 'log')!r})))\n"
         "print(c.process.pid, flush=True); time.sleep(600)"
     )
@@ -89,3 +89,13 @@ def test_children_die_when_the_supervisor_is_killed(tmp_path: Path) -> None:
     parent.kill()
     parent.wait()
     assert gone(pid)
+
+
+def test_an_installation_is_held_by_one_at_a_time(tmp_path: Path) -> None:
+    first = hold_alone(tmp_path)
+    assert first is not None
+    assert hold_alone(tmp_path) is None
+    first.close()
+    second = hold_alone(tmp_path)
+    assert second is not None
+    second.close()

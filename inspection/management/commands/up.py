@@ -23,7 +23,7 @@ from django.conf import settings
 from django.core.management import call_command
 from django.core.management.base import BaseCommand, CommandError, CommandParser
 
-from inspection.supervise import Child, Supervisor, raise_on_signals
+from inspection.supervise import Child, Supervisor, hold_alone, raise_on_signals
 
 #: Longest wait for a service to answer after its start, in seconds. Far above the usual 1-5 s of two slow cores.
 READY_S = 90.0
@@ -47,6 +47,12 @@ class Command(BaseCommand):
     def handle(self, *args: Any, **options: Any) -> None:
         raise_on_signals()
         self.began = time.monotonic()
+        lock = hold_alone(settings.HOME)
+        if lock is None:
+            raise CommandError(
+                f"Edgewatch already runs on {settings.HOME}. Stop it first (Ctrl-C in its terminal), "
+                "or set EDGEWATCH_HOME to another folder."
+            )
         self.logs = settings.HOME / "logs"
         # Short, because a unix socket's path must stay under 108 bytes whatever the project's path.
         self.run = Path(tempfile.mkdtemp(prefix="edgewatch-"))
@@ -61,6 +67,7 @@ class Command(BaseCommand):
             signal.signal(signal.SIGTERM, signal.SIG_IGN)
             self.supervisor.stop()
             shutil.rmtree(self.run, ignore_errors=True)
+            lock.close()
         self.say("Everything is stopped.")
 
     def say(self, text: str) -> None:

@@ -6,15 +6,16 @@ const panel = document.getElementById("range");
 const map = panel.querySelector("[data-map]");
 const wait = map.querySelector(".chart-wait");
 const cuts = panel.querySelector("[data-cuts]");
-const shapes = JSON.parse(document.getElementById("damage-shapes").textContent);
 const rowMm = panel.dataset.rowUm / 1000;
 const profileMm = panel.dataset.profileUm / 1000;
 const rows = Number(panel.dataset.rows);
 const profiles = Number(panel.dataset.profiles);
 // "Along" is the scan and the edge, "across" the laser line. An image much longer across is drawn lying on its side.
-const along = { title: "along the edge, mm", step: profileMm, count: profiles, low: -profileMm / 2, high: (profiles - 0.5) * profileMm };
-const across = { title: "across the bevel, mm", step: rowMm, count: rows, low: -rowMm / 2, high: (rows - 0.5) * rowMm };
-const turned = across.high > 1.3 * along.high;
+// Positions along the edge count from the tool's datum, as in every table; the image begins where its region does.
+const startMm = Number(panel.dataset.startMm);
+const along = { title: "along the edge, mm", step: profileMm, count: profiles, start: startMm, low: startMm - profileMm / 2, high: startMm + (profiles - 0.5) * profileMm };
+const across = { title: "across the bevel, mm", step: rowMm, count: rows, start: 0, low: -rowMm / 2, high: (rows - 0.5) * rowMm };
+const turned = across.high - across.low > 1.3 * (along.high - along.low);
 const [flat, upright] = turned ? [across, along] : [along, across];
 const whole = { x: [flat.low, flat.high], y: [upright.high, upright.low] };
 const fit = () => {
@@ -23,15 +24,20 @@ const fit = () => {
 };
 /** A picture as plotly takes it, turned if the map is. */
 function laid({ z, x0, y0, dx, dy }) {
-  if (!turned) return { z, x0, dx, y0, dy };
+  if (!turned) return { z, x0: x0 + startMm, dx, y0, dy };
   const lying = Array.from(z[0], (_, column) => Float32Array.from(z, (row) => row[column]));
-  return { z: lying, x0: y0, dx: dy, y0: x0, dy: dx };
+  return { z: lying, x0: y0, dx: dy, y0: x0 + startMm, dy: dx };
 }
 /** A point given as (along, across) in plot coordinates. */
 const place = (a, b) => (turned ? [b, a] : [a, b]);
 //: Cells along the longer side that a weak tablet still draws at once.
 const CELLS = 600;
 const CELLS_3D = 240;
+
+const shapes = JSON.parse(document.getElementById("damage-shapes").textContent).map((damage) => ({
+  ...damage, x0: damage.x0 + startMm, x1: damage.x1 + startMm,
+  outline: damage.outline.map((line) => line.map(([x, y]) => [x + startMm, y])),
+}));
 
 let channel = "level";
 let solid = false;
@@ -57,7 +63,7 @@ function scaleOf(picture) {
 function damageShapes() {
   return shapes.map((damage) => {
     const line = { color: "#e4572e", width: 2 };
-    const outline = damage.outline?.length
+    const outline = damage.outline.length
       ? damage.outline.map((points) => `M${points.map(([x, y]) => place(x, y).join(",")).join("L")}Z`).join("")
       : null;
     const [x0, y0] = place(damage.x0, damage.y0);
@@ -110,7 +116,7 @@ async function draw() {
       const axis = (index, count, step, start) => Array.from({ length: count }, (_, i) => start + i * step);
       Plotly.purge(map);
       await Plotly.newPlot(map, [{
-        type: "surface", z: picture.z.map((row) => Array.from(row)), x: axis(0, picture.columns, picture.dx, picture.x0),
+        type: "surface", z: picture.z.map((row) => Array.from(row)), x: axis(0, picture.columns, picture.dx, picture.x0 + startMm),
         y: axis(1, picture.rows, picture.dy, picture.y0), colorscale, cmin: zmin, cmax: zmax, colorbar: bar,
         hovertemplate: `%{x:.3f} mm, %{y:.3f} mm<br>%{z:.1f} ${unit}<extra></extra>`,
       }], look({
@@ -154,7 +160,7 @@ async function refine() {
   const mine = ++latest;
   const [x, y] = [map.layout.xaxis.range, map.layout.yaxis.range];
   const span = (range, axis) => {
-    const [low, high] = [Math.min(...range) / axis.step, Math.max(...range) / axis.step];
+    const [low, high] = [Math.min(...range), Math.max(...range)].map((mm) => (mm - axis.start) / axis.step);
     return [Math.max(0, Math.floor(low)), Math.min(axis.count, Math.ceil(high) + 1)];
   };
   const [cols, rowSpan] = place(span(x, flat), span(y, upright));
@@ -181,9 +187,10 @@ function reset() {
 async function clicked(event) {
   const [x, y] = place(event.points[0].x, event.points[0].y);  // turning twice is not turning
   const row = Math.min(rows - 1, Math.max(0, Math.round(y / rowMm)));
-  const profile = Math.min(profiles - 1, Math.max(0, Math.round(x / profileMm)));
-  const [x1, y1] = place(profile * profileMm, row * rowMm);
-  point = { x: x1, y: y1, along: profile * profileMm, across: row * rowMm };
+  const profile = Math.min(profiles - 1, Math.max(0, Math.round((x - startMm) / profileMm)));
+  const at = { along: startMm + profile * profileMm, across: row * rowMm };
+  const [x1, y1] = place(at.along, at.across);
+  point = { x: x1, y: y1, ...at };
   Plotly.relayout(map, { shapes: [...damageShapes(), ...crosshair()] });
   const query = new URLSearchParams({ row, col: profile, channel, result: panel.dataset.result });
   const answer = await fetch(`${panel.dataset.cut}?${query}`);
@@ -192,18 +199,18 @@ async function clicked(event) {
   const words = panel.querySelector("[data-cut-words]");
   if (!answer.ok) { words.textContent = cut.detail; return; }
   words.textContent = `Profiles through row ${row} (${point.across.toFixed(3)} mm across) and profile ${profile} (${point.along.toFixed(3)} mm along)`;
-  profileChart(panel.querySelector("[data-along]"), cut.along, along.title, point.along, cut.unit);
-  profileChart(panel.querySelector("[data-across]"), cut.across, across.title, point.across, cut.unit);
+  profileChart(panel.querySelector("[data-along]"), cut.along, along, point.along, cut.unit);
+  profileChart(panel.querySelector("[data-across]"), cut.across, across, point.across, cut.unit);
 }
 
-function profileChart(element, line, title, here, unit) {
+function profileChart(element, line, axis, here, unit) {
   const trace = {
-    type: "scatter", mode: "lines", y: line.values, x0: 0, dx: line.step_mm, line: { color: colour("--accent"), width: 1.5 },
+    type: "scatter", mode: "lines", y: line.values, x0: axis.start, dx: line.step_mm, line: { color: colour("--accent"), width: 1.5 },
     connectgaps: false, hovertemplate: `%{x:.3f} mm: %{y:.1f} ${unitWord(unit)}<extra></extra>`,
   };
   const mark = { type: "line", x0: here, x1: here, yref: "paper", y0: 0, y1: 1, line: { color: colour("--ink"), width: 1, dash: "dot" } };
   Plotly.react(element, [trace], look({
-    shapes: [mark], margin: { l: 52, r: 8, t: 6, b: 42 }, xaxis: { title: { text: title } }, yaxis: { title: { text: unitWord(unit) } },
+    shapes: [mark], margin: { l: 52, r: 8, t: 6, b: 42 }, xaxis: { title: { text: axis.title } }, yaxis: { title: { text: unitWord(unit) } },
   }), config);
 }
 
