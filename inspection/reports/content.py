@@ -21,7 +21,7 @@ from inspection.reports.rows import verdict_of_visit
 from inspection.reports.stored import load
 from inspection.selectors.trend import tool_trends
 from inspection.states import ScanState, Verdict
-from inspection.units import unit_sign
+from inspection.units import unit_sign, with_unit_signs
 from scanning.errors import BadInput
 
 Json = dict[str, Any]
@@ -110,7 +110,9 @@ def _region(scan: Scan, result: RangeImage | None) -> Json:
         "state": scan.state,
         "verdict": result.verdict if result else Verdict.UNKNOWN,
         "partial": scan.partial,
-        "reasons": [str(reason) for reason in result.verdict_reasons] if result else [_no_result(scan)],
+        "reasons": [with_unit_signs(str(reason)) for reason in result.verdict_reasons]
+        if result
+        else [_no_result(scan)],
         "measured": result is not None,
         "picture": None,
         "caption": "",

@@ -86,19 +86,19 @@ def judge(
             distrust.append(f"{name} is in {got.unit} but its limit is in {limit.unit}; set the limit anew.")
         elif limit.replace_above is not None and got.value > limit.replace_above:
             worst = Verdict.REPLACE
-            findings.insert(0, f"{shown}, above the replace limit of {limit.replace_above:g}.")
+            findings.insert(0, f"{shown}, above the replace limit of {limit.replace_above:g} {limit.unit}.")
         elif limit.watch_above is not None and got.value > limit.watch_above:
             worst = Verdict.WATCH if worst == Verdict.OK else worst
-            findings.append(f"{shown}, above the watch limit of {limit.watch_above:g}.")
+            findings.append(f"{shown}, above the watch limit of {limit.watch_above:g} {limit.unit}.")
         elif limit.replace_above is not None and bound > limit.replace_above:
             worst = Verdict.WATCH if worst == Verdict.OK else worst
             findings.append(
                 f"{shown} with an upper 95 % bound of {_figure(bound)}, beyond the replace limit of "
-                f"{limit.replace_above:g}: replacing cannot be ruled out."
+                f"{limit.replace_above:g} {limit.unit}: replacing cannot be ruled out."
             )
         else:
             low = limit.watch_above if limit.watch_above is not None else limit.replace_above
-            within.append(f"{shown}, within its limit of {low:g}.")
+            within.append(f"{shown}, within its limit of {low:g} {limit.unit}.")
     if not limits:
         distrust.append("No limits are set for this tool type, so nothing can be called ok.")
     if calibration is None:

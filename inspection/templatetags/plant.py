@@ -9,7 +9,6 @@ from __future__ import annotations
 import datetime as dt
 import json
 import math
-import re
 from typing import Any, Final
 
 from django import template
@@ -22,6 +21,8 @@ from django.utils.safestring import SafeString, mark_safe
 from inspection.models import AuditEvent, Event, Schedule
 from inspection.selectors.due import colour as due_colour
 from inspection.states import ScanState, Verdict
+from inspection.units import unit_sign as pretty_unit
+from inspection.units import with_unit_signs
 
 register = template.Library()
 
@@ -87,13 +88,13 @@ NOT_MEASURED: Final = mark_safe('<span class="missing">not measured</span>')
 
 @register.simple_tag
 def icon(name: str) -> SafeString:
-    drawing = mark_safe(ICONS[name])  # noqa: S308 - our own constant
+    drawing = mark_safe(ICONS[name])  # our own constant
     return format_html('<svg class="icon" viewBox="0 0 24 24" aria-hidden="true">{}</svg>', drawing)
 
 
 @register.simple_tag
 def brand_mark() -> SafeString:
-    return mark_safe(MARK)  # noqa: S308 - our own constant
+    return mark_safe(MARK)  # our own constant
 
 
 @register.simple_tag
@@ -174,19 +175,8 @@ def quantity(value: float | None, u: float | None = None, unit: str = "") -> Saf
     return format_html('{} <span class="unit">{}</span>', text, pretty_unit(unit))
 
 
-#: Records and files spell units in ASCII; people read them as they are printed elsewhere.
-UNITS: Final[dict[str, str]] = {"um": "µm", "um2": "µm²", "mm2": "mm²", "mm3": "mm³", "um3": "µm³"}
-
-
-@register.filter
-def pretty_unit(unit: str) -> str:
-    return {**UNITS, "1": "", "deg": "°"}.get(unit, unit)
-
-
-@register.filter
-def with_units(sentence: str) -> str:
-    """A sentence of the measuring side with its units as people write them."""
-    return re.sub(r"(?<=[\d ])(um|mm)([23]?)\b", lambda found: UNITS.get(found[0], found[0]), sentence)
+register.filter("pretty_unit", pretty_unit)
+register.filter("with_units", with_unit_signs)
 
 
 @register.filter
