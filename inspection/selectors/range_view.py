@@ -224,12 +224,8 @@ def _nullable(line: Float32) -> list[float | None]:
     return [round(float(value), 3) if np.isfinite(value) else None for value in line]
 
 
-def difference(newer: RangeImage, older: RangeImage) -> Float32:
-    """Levelled newer minus levelled older on the older's grid cut to the newer's size; negative is material lost.
-
-    Both scans are taken at the same stage positions; there is no registration here, so a knife that was clamped
-    differently shows as a ridge along every slope. Raises BadInput when the grids have different pitches.
-    """
+def check_same_pitch(newer: RangeImage, older: RangeImage) -> None:
+    """Raise BadInput if the pixels of two range images are not of one size, so that nothing can be subtracted."""
     same = np.isclose(newer.row_pitch_um, older.row_pitch_um, rtol=1e-3) and np.isclose(
         newer.profile_pitch_um, older.profile_pitch_um, rtol=1e-3
     )
@@ -239,6 +235,15 @@ def difference(newer: RangeImage, older: RangeImage) -> Float32:
             f"{older.row_pitch_um:.2f} x {older.profile_pitch_um:.2f} um), so they cannot be subtracted; compute one "
             "of them again with the recipe of the other."
         )
+
+
+def difference(newer: RangeImage, older: RangeImage) -> Float32:
+    """Levelled newer minus levelled older, cut to the part both have; negative is material lost.
+
+    Both scans are taken at the same stage positions; there is no registration here, so a knife that was clamped
+    differently shows as a ridge along every slope. Raises BadInput when the pitches differ.
+    """
+    check_same_pitch(newer, older)
     a, b = values(newer, "level"), values(older, "level")
     rows, profiles = min(a.shape[0], b.shape[0]), min(a.shape[1], b.shape[1])
     return a[:rows, :profiles] - b[:rows, :profiles]

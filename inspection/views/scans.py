@@ -11,7 +11,7 @@ from django.views.decorators.http import require_POST, require_safe
 
 from inspection.models import Inspection, Measurement, RangeImage, Recipe, Scan, User
 from inspection.selectors.overview import worst
-from inspection.selectors.range_view import CHANNELS
+from inspection.selectors.range_view import CHANNELS, check_same_pitch
 from inspection.selectors.scan import ScanPage, comparable, progress, progress_version, scan_state
 from inspection.selectors.tool import key_numbers, numbers
 from inspection.services import queue
@@ -154,11 +154,23 @@ def scan_compare(request: SignedIn, pk: int) -> HttpResponse:
             if scan.finished_at and (image.scan.finished_at or image.created_at) < scan.finished_at
         ]
         chosen = next(iter(earlier or others), None)
-    rows = []
+    rows, fault = [], ""
     if mine and chosen:
+        try:
+            check_same_pitch(mine, chosen)
+        except Fault as caught:
+            fault = str(caught)
         before = {m.metric: m for m in chosen.measurements.all()}
         rows = [_changed(m, before[m.metric]) for m in mine.measurements.all() if m.metric in before]
-    context = {"scan": scan, "tool": scan.region.tool, "mine": mine, "other": chosen, "others": others, "rows": rows}
+    context = {
+        "scan": scan,
+        "tool": scan.region.tool,
+        "mine": mine,
+        "other": chosen,
+        "others": others,
+        "rows": rows,
+        "fault": fault,
+    }
     return render(request, "scan/compare.html", context)
 
 

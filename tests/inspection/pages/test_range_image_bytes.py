@@ -184,3 +184,6 @@ def test_a_scan_less_itself_is_zero_and_other_pitches_are_refused(browse: Browse
     answer = browse("vera").get(url, {"with": coarse.pk})
     assert answer.status_code == 400
     assert "different pitches" in answer.json()["detail"]
+    page = browse("vera").get(reverse("scan-compare", args=[image.scan_id]), {"with": coarse.pk}).content.decode()
+    assert "so they cannot be subtracted" in page
+    assert "data-difference" not in page
