@@ -107,7 +107,7 @@ def test_an_operator_scans_a_knife_reads_its_verdict_and_takes_the_report_away(
         taken.value.save_as(report)
         assert report.read_bytes().startswith(b"%PDF")
 
-        page.locator("section.region", has=page.get_by_role("heading", name="R3")).get_by_role("link").click()
+        page.locator("section.region", has=page.get_by_role("heading", name="R3")).get_by_text("See the surface").click()
         olga.wait_for_surface()
         assert "large" in page.locator("main").inner_text()
         assert olga.complaints == []

@@ -9,7 +9,8 @@ import pytest
 from django.utils import timezone
 
 from inspection.selectors.overview import worst
-from inspection.templatetags.plant import ago_words, duration, figure, percent, quantity, with_uncertainty, with_units
+from inspection.templatetags.plant import ago_words, duration, figure, percent, quantity, with_uncertainty
+from inspection.units import with_unit_signs as with_units
 
 
 @pytest.mark.parametrize(
