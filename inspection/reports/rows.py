@@ -13,7 +13,7 @@ from typing import Any
 from django.db.models import Count, OuterRef, QuerySet, Subquery
 from django.utils import timezone
 
-from inspection.models import Damage, Measurement, RangeImage, Scan, Tool
+from inspection.models import Damage, Measurement, RangeImage, Region, Scan, Tool
 from inspection.states import VERDICT_ORDER, Verdict
 
 #: A cell: text is a person's words and may hold anything; numbers and moments are ours.
@@ -184,14 +184,15 @@ def tools_table(selection: Selection) -> Table:
 
 def latest_verdicts(tools: QuerySet[Tool]) -> dict[int, tuple[str, dt.datetime]]:
     """Each tool's worst verdict over the newest result of every region, and when the newest of them was scanned."""
-    newest = (
-        RangeImage.objects.filter(scan__region=OuterRef("scan__region"))
-        .order_by("-scan__queued_at", "-scan_id", "-created_at", "-pk")
-        .values("pk")[:1]
+    # One look-up per region, not per range image: the latter grows with the square of a tool's history.
+    newest = RangeImage.objects.filter(scan__region=OuterRef("pk")).order_by(
+        "-scan__queued_at", "-scan_id", "-created_at", "-pk"
     )
-    found = RangeImage.objects.filter(
-        scan__region__tool__in=tools.values("pk"), scan__region__active=True, pk=Subquery(newest)
-    ).values_list("scan__region__tool_id", "verdict", "scan__queued_at")
+    regions = Region.objects.filter(tool__in=tools.values("pk"), active=True)
+    shown = regions.annotate(newest=Subquery(newest.values("pk")[:1])).values_list("newest", flat=True)
+    found = RangeImage.objects.filter(pk__in=[pk for pk in shown if pk is not None]).values_list(
+        "scan__region__tool_id", "verdict", "scan__queued_at"
+    )
     worst: dict[int, tuple[str, dt.datetime]] = {}
     for tool, verdict, at in found:
         before = worst.get(tool, (verdict, at))
