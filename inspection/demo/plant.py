@@ -20,10 +20,10 @@ from django.conf import settings
 from django.utils import timezone
 
 from inspection.demo.gauge import gauge_pairs
-from inspection.demo.history import make_history
+from inspection.demo.history import RECESSION_UM_PER_HOUR, individual, make_history
 from inspection.models import Calibration, Rig, Role, Scan, Schedule, Tool, ToolType, User
 from inspection.services.calibrations import add_calibration
-from inspection.services.plant import create_tool, create_tool_type, record_event
+from inspection.services.plant import DEFAULT_REGIONS, create_tool, create_tool_type, record_event
 from inspection.services.schedules import save_schedule
 
 DEMO_RIG = "demo-rig"
@@ -61,8 +61,23 @@ def rig_config(speed_up: float) -> dict[str, Any]:
         "laser": {"power": 1.0},
         "camera": {"driver": "simulated", "address": str(folder / "camera.sock")},
         "sensor": {"columns": 256},
-        "simulated": {"dir": str(folder), "speed_up": speed_up, "parts": {}},
+        "simulated": {"dir": str(folder), "speed_up": speed_up, "parts": demo_parts()},
     }
+
+
+def demo_parts() -> dict[str, Any]:
+    """What lies on the simulated rig when a demo knife is scanned: worn as its hours say; only KN-07 is damaged."""
+    parts: dict[str, Any] = {}
+    for code, (_, hours) in KNIVES.items():
+        worn = {"wear_um": RECESSION_UM_PER_HOUR * hours}
+        if code == DEMO_TOOL:
+            parts[code] = {region: worn for region in DEFAULT_REGIONS}
+        else:
+            parts[code] = {
+                region: {**worn, "scene": "R1", "seed": individual(code) + number}
+                for number, region in enumerate(DEFAULT_REGIONS)
+            }
+    return parts
 
 
 def make_demo_plant(say: Callable[[str], None], *, speed_up: float = 20.0) -> DemoPlant:
