@@ -71,7 +71,7 @@ def demo_parts() -> dict[str, Any]:
     for code, (_, hours) in KNIVES.items():
         worn = {"wear_um": RECESSION_UM_PER_HOUR * hours}
         if code == DEMO_TOOL:
-            parts[code] = {region: worn for region in DEFAULT_REGIONS}
+            parts[code] = dict.fromkeys(DEFAULT_REGIONS, worn)
         else:
             parts[code] = {
                 region: {**worn, "scene": "R1", "seed": individual(code) + number}
