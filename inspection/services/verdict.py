@@ -80,7 +80,7 @@ def judge(
             distrust.append(NOT_MEASURED.get(limit.metric, f"{limit.metric} has a limit but was not measured."))
             continue
         name = got.label or limit.metric
-        shown = f"{name} is {_figure(got.value)} {limit.unit}"
+        shown = f"{name} is {_figure(got.value, got.u)} {limit.unit}"
         bound = got.value + COVERAGE_K * got.u if got.u is not None and math.isfinite(got.u) else got.value
         if got.unit and got.unit != limit.unit:
             distrust.append(f"{name} is in {got.unit} but its limit is in {limit.unit}; set the limit anew.")
@@ -93,7 +93,7 @@ def judge(
         elif limit.replace_above is not None and bound > limit.replace_above:
             worst = Verdict.WATCH if worst == Verdict.OK else worst
             findings.append(
-                f"{shown} with an upper 95 % bound of {_figure(bound)}, beyond the replace limit of "
+                f"{shown} with an upper 95 % bound of {_figure(bound, got.u)}, beyond the replace limit of "
                 f"{limit.replace_above:g} {limit.unit}: replacing cannot be ruled out."
             )
         else:
@@ -122,5 +122,8 @@ def judge(
     return Judgement(Verdict.UNKNOWN, [*distrust, *findings])
 
 
-def _figure(value: float) -> str:
+def _figure(value: float, u: float | None = None) -> str:
+    """Three digits at most, and none below the uncertainty's first: digits nobody measured are no reason."""
+    if u is not None and math.isfinite(u) and u > 0:
+        value = round(value, -math.floor(math.log10(u))) + 0.0  # + 0.0 turns -0.0 into 0
     return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"

@@ -133,3 +133,12 @@ def test_impossible_limits_are_refused_whole(
         set_limits(tool_type, asked, by=erik, reason=reason)
 
     assert not tool_type.limit_sets.exists()
+
+
+def test_a_reason_shows_no_digits_below_the_uncertainty() -> None:
+    from inspection.services.verdict import _figure
+
+    assert _figure(-0.00265, 2.2) == "0"
+    assert _figure(123.456, 1.7) == "123"
+    assert _figure(0.034331, 0.00012) == "0.0343"
+    assert _figure(0.0281) == "0.0281"
