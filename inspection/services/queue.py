@@ -16,10 +16,11 @@ from django.db import transaction
 from django.db.models import Max, Min
 from django.utils import timezone
 
+import scanning.recipe
 from inspection.models import Inspection, LimitSet, Recipe, Recomputation, Region, Rig, Scan, Tool, User
 from inspection.services.audit import audit
 from inspection.services.moves import WrongState, move
-from inspection.services.recipes import recipe_named, recipe_of
+from inspection.services.recipes import recipe_named, recipe_of, recipe_row
 from inspection.services.ring import ring, ring_recompute
 from inspection.states import ENDED, ON_RIG, QueueState, ScanState
 from scanning.errors import BadInput
@@ -139,7 +140,9 @@ def default_recipe(rig: Rig, exposures_us: Sequence[float]) -> Recipe:
         return recipe_named(str(named))
     if exposures_us[0] == 0.0:
         return recipe_named("HDR-CAM")
-    return recipe_named("HDRE-II" if len(exposures_us) > 1 else "SCI")
+    best = scanning.recipe.Recipe.named("HDRE-II" if len(exposures_us) > 1 else "SCI")
+    # Sliding keeps the step as pitch: damage of a tenth of a millimetre stays visible.
+    return recipe_row(best.with_settings({"sci.mode": "sliding"}))
 
 
 def plan_for(region: Region, rig: Rig, exposures_us: Sequence[float], recipe: Recipe) -> dict[str, Any]:

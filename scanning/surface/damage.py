@@ -12,6 +12,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -49,6 +50,8 @@ RING_UM = 15.0
 RING_K = 3.0
 RING_SHARE = 0.05
 FURTHEST_RING_UM = 150.0
+#: Missing material that reaches no further than this behind the end of the light is the edge's own wear.
+BRINK_UM = 60.0
 #: Draws of noise with which the excess of a largest value over the true one is estimated.
 NOISE_DRAWS = 24
 #: Enclosed sound islands up to this many times the least damage area belong to the damage.
@@ -90,6 +93,34 @@ class DamageFinding:
     rows: tuple[int, int]
     profiles: tuple[int, int]
     mask_runs: tuple[tuple[int, int, int], ...]
+
+
+def without_brink(
+    found: Detection, residual_um: Float32, valid: Mask, side: Literal["first", "last"], row_pitch_um: float
+) -> Detection:
+    """Leave out what lies at the very edge only, within some two line widths of where the light ends.
+
+    There the line's image is cut off by the edge and by the worn rounding, so single heights are off by tens of
+    micrometres; a chip that matters reaches further into the bevel. What is left out here still counts as edge
+    recession. ``side`` is the end of the rows at which the edge is.
+    """
+    if found.count == 0:
+        return found
+    rows = residual_um.shape[0]
+    seen = valid if side == "first" else valid[::-1]
+    behind = np.arange(rows)[:, None] - np.argmax(seen, axis=0)[None, :]
+    distance_um = (behind if side == "first" else behind[::-1]) * row_pitch_um
+    clear = valid & (np.abs(residual_um) > 3.0 * found.sigma_depth_um)
+    furthest = ndimage.maximum(np.where(clear, distance_um, -1.0), found.labels, index=np.arange(1, found.count + 1))
+    kept = np.flatnonzero(np.asarray(furthest) > BRINK_UM) + 1
+    renumbered = np.zeros(found.count + 1, dtype=np.int32)
+    renumbered[kept] = np.arange(1, kept.size + 1)
+    return dataclasses.replace(
+        found,
+        labels=renumbered[found.labels],
+        count=int(kept.size),
+        reach_um=tuple(found.reach_um[number - 1] for number in kept),
+    )
 
 
 @dataclass(frozen=True)

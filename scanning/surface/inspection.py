@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from scanning.errors import BadInput
 from scanning.range_image import RangeImage
-from scanning.surface.damage import DamageFinding, detect, findings, lost_at_edge
+from scanning.surface.damage import DamageFinding, Detection, detect, findings, lost_at_edge, without_brink
 from scanning.surface.edge import distance_to_edge_um, expected_surface, find_edge, roll_off
 from scanning.surface.filters import Float32, Float64, Mask, dilate, label, too_narrow_to_see, wild_pixels
 from scanning.surface.noise import Noise, local_noise, measure_noise, robust_sigma
@@ -155,8 +155,11 @@ def _inspect(
                 "measured from that prevailing shape, and the recession and rounded length describe the shape itself."
             )
 
-    missing = detect(residual, valid, row_pitch, profile_pitch, settings, sign=-1)
-    raised = detect(residual, valid, row_pitch, profile_pitch, settings, sign=+1)
+    def search(sign: int) -> Detection:
+        found = detect(residual, valid, row_pitch, profile_pitch, settings, sign=sign)
+        return found if edge is None else without_brink(found, residual, valid, edge.side, row_pitch)
+
+    missing, raised = search(-1), search(+1)
     touched = (missing.labels > 0) | (raised.labels > 0)
     if touched.any():
         # Damage shallower than the fit's tolerance has pulled the reference a little towards itself: fit once more
@@ -166,8 +169,7 @@ def _inspect(
             again = fit_plane(residual, row_pitch, profile_pitch, form=settings.form, use=calm)
             residual = residual - again.height_um()
             plane = plane.shifted(again)
-            missing = detect(residual, valid, row_pitch, profile_pitch, settings, sign=-1)
-            raised = detect(residual, valid, row_pitch, profile_pitch, settings, sign=+1)
+            missing, raised = search(-1), search(+1)
             touched = (missing.labels > 0) | (raised.labels > 0)
     sound = valid & ~dilate(touched, 2.0 * settings.wide_scale_um, row_pitch, profile_pitch)
     if np.count_nonzero(sound) < max(200, 0.05 * np.count_nonzero(valid)):

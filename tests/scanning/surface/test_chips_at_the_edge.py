@@ -96,3 +96,18 @@ def test_an_edge_along_the_laser_line_is_measured_by_turning_the_axes():
     for found in report.damages:
         rows, profiles = slice(*found.rows), slice(*found.profiles)
         assert np.count_nonzero(report.damage_labels[rows, profiles] == found.number) == found.pixels
+
+
+@pytest.mark.parametrize("side", ["first", "last"])
+def test_unsteady_heights_at_the_very_brink_are_wear_and_not_damage(side):
+    nicks = tuple(Chip(200.0 + 300.0 * k, 120.0, 45.0, 40.0) for k in range(6))
+    report = inspect_surface(knife(chips=nicks, side=side, seed=3))
+    assert report.damages == []
+    assert report.measurement("ER_max").value > 20.0, "what is no damage still counts as recession"
+
+
+def test_a_chip_that_reaches_into_the_bevel_is_kept_whole():
+    chip = Chip(900.0, 150.0, 110.0, 42.0)
+    (found,) = inspect_surface(knife(chips=(chip,), seed=3)).damages
+    assert found.severity == "minor"
+    assert found.volume_mm3 == pytest.approx(chip.volume_mm3, rel=0.15)
