@@ -101,7 +101,12 @@ class Line:
     check between width/factor and width*factor. ``gate_px``, ``gate_max_px``: how far the line may move from row to
     row: gate_px (1 + rows missed), at most gate_max_px. ``seed``: ``first`` follows the line from the first good row
     from the bottom; ``best`` also tries others and takes the line most like the line.
-    The paper to the letter is floor 0.1, floor_from zero, ceiling 0, snr 0, grain_px 0, seed first.
+    ``candidates``: "noise" takes everything ``snr`` spreads above the noise (standing_out.py; k, floor_from and ceiling
+    are not used, ``floor`` is the share of its own height at which a candidate's base ends), "threshold" the peaks above
+    the paper's threshold. ``continuity``: "path" is the best path through the candidates of all rows (path.py; gate_px,
+    and seed are not used), ``jump`` its price of a jump, in rows; "nearest" follows the nearest candidate. "auto" is
+    noise and path, but threshold and nearest for lines wider than 12 px, whose background is structure and not noise.
+    `LITERAL`, or the setting ``msnn.reading=literal``, is the paper to the letter.
     """
 
     key: ClassVar[str] = "msnn"
@@ -116,9 +121,9 @@ class Line:
     gate_px: float = 12.0
     gate_max_px: float = 64.0
     seed: str = "best"
-    candidates: str = "threshold"
-    continuity: str = "nearest"
-    jump: float = 6.0
+    candidates: str = "auto"
+    continuity: str = "auto"
+    jump: float = 10.0
 
     def __post_init__(self) -> None:
         if self.k is not None:
@@ -137,9 +142,20 @@ class Line:
         _number("msnn.gate_px", self.gate_px, 0.0, 1e6)
         _number("msnn.gate_max_px", self.gate_max_px, self.gate_px, 1e6)
         _choice("msnn.seed", self.seed, ("first", "best"))
-        _choice("msnn.candidates", self.candidates, ("threshold", "noise"))
-        _choice("msnn.continuity", self.continuity, ("nearest", "path"))
+        _choice("msnn.candidates", self.candidates, ("auto", "threshold", "noise"))
+        _choice("msnn.continuity", self.continuity, ("auto", "nearest", "path"))
         _number("msnn.jump", self.jump, 0.0, 1000.0)
+
+
+LITERAL: dict[str, str] = {
+    "msnn.candidates": "threshold", "msnn.continuity": "nearest", "msnn.floor": "0.1", "msnn.floor_from": "zero",
+    "msnn.ceiling": "0", "msnn.snr": "0", "msnn.grain_px": "0", "msnn.seed": "first",
+}  # fmt: skip
+"""MSNN as the paper prints it; ``msnn.reading=literal`` stands for all of these."""
+SHIPPED: dict[str, str] = {
+    "msnn.candidates": "auto", "msnn.continuity": "auto", "msnn.floor": "default", "msnn.floor_from": "row_mean",
+    "msnn.ceiling": "0.5", "msnn.snr": "default", "msnn.grain_px": "default", "msnn.seed": "best",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -244,7 +260,11 @@ class Recipe:
         """The same recipe with some parameters changed; keys like "sci.mode", "glt.p", "exposure", "exposures"."""
         recipe = self
         for name, text in settings.items():
-            recipe = recipe._with_setting(name, text)
+            if name == "msnn.reading":
+                _choice(name, text, ("literal", "shipped"))
+                recipe = recipe.with_settings(LITERAL if text == "literal" else SHIPPED)
+            else:
+                recipe = recipe._with_setting(name, text)
         return recipe
 
     def setting_names(self) -> tuple[str, ...]:

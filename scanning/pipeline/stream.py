@@ -6,6 +6,7 @@ reprocessing give the same numbers bit for bit. Memory is that of a few images, 
 
 from __future__ import annotations
 
+import math
 import platform
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -35,9 +36,11 @@ RAW_FLOOR = 0.1
 LOGARITHMIC_FLOOR = 0.6
 RAW_SNR, COMPRESSED_SNR = 4.0, 3.0
 GRAIN_PX = 3.0
-REACH = 3.0
+REACH = 2.2
 """Line widths the base reaches to either side at most."""
 PATHS_ALIVE = 1024
+WIDE_PX = 12.0
+"""Wider lines than this come from lamp-lit pictures of others: what they must stand out of is structure, not noise."""
 INT32_TOP = (1 << 31) - 1
 Progress = Callable[[int, int], None]
 Float64 = NDArray[np.float64]
@@ -81,6 +84,8 @@ class Settled:
     floor: float
     snr: float
     grain_px: float
+    candidates: str
+    continuity: str
     estimated: tuple[str, ...]
 
 
@@ -233,6 +238,7 @@ class ProfileStream:
         expected = line.width_px
         if expected is None and width is not None:
             expected = width * broadening(self.recipe.tone.p) if self.recipe.tone is not None else width
+        wide = (line.width_px or width or 0.0) > WIDE_PX
         self.settled = Settled(
             exposures_us=tuple(h.exposures_us[e] for e in selected),
             dark_levels=tuple(darks[e] for e in selected),
@@ -244,6 +250,8 @@ class ProfileStream:
             grain_px=line.grain_px
             if line.grain_px is not None
             else max(GRAIN_PX, (line.width_px or width or 0.0) / 4.0),
+            candidates=line.candidates if line.candidates != "auto" else ("threshold" if wide else "noise"),
+            continuity=line.continuity if line.continuity != "auto" else ("nearest" if wide else "path"),
             estimated=tuple(estimated),
         )
         self._chain = _Chain(self.recipe, h, self.settled, selected)
@@ -268,6 +276,8 @@ class ProfileStream:
             "threshold_floor": None if settled is None else settled.floor,
             "threshold_snr": None if settled is None else settled.snr,
             "grain_px": None if settled is None else settled.grain_px,
+            "candidates": None if settled is None else settled.candidates,
+            "continuity": None if settled is None else settled.continuity,
             "estimated": [] if settled is None else list(settled.estimated),
             "notes": notes,
             "versions": {
@@ -337,21 +347,23 @@ class _Chain:
             self._grey_level = float(1 << 20)
 
         width = settled.expected_width_px
-        unit = settled.line_width_px if settled.line_width_px is not None else GRAIN_PX
+        unit = line.width_px or settled.line_width_px or GRAIN_PX
+        by_noise = settled.candidates == "noise"
+        share = 0.5
         box = box_for(width)
         self._line = (
-            line.candidates == "noise", line.continuity == "path", settled.k, settled.floor, line.floor_from == "row_mean", line.ceiling, settled.snr,
+            by_noise, settled.continuity == "path", settled.k, settled.floor, line.floor_from == "row_mean", line.ceiling, settled.snr,
             settled.grain_px,
             1.0 if width is None else width, np.inf if width is None else line.width_factor,
-            line.gate_px, line.gate_max_px, line.seed == "best", unit, line.jump, round(REACH * (width or unit)), box,
+            line.gate_px, line.gate_max_px, line.seed == "best", unit, line.jump, math.ceil(REACH * unit), box, share,
         )  # fmt: skip
         most = columns // 2 + 1
         self._scratch = (  # light, base, shape, height, counts, chosen, and for noise and path: see their files
             np.empty(rows, np.int64),
             np.empty((rows, most, 2), np.int64), np.empty((rows, most, 2)), np.empty((rows, most), np.int64),
             np.zeros(rows, np.int64), np.empty(rows, np.int64),
-            np.empty((3, columns), np.int64), np.empty(PLACES, np.int64), np.empty(most, np.int64),
-            np.empty((rows, most)), np.empty((rows, most)), np.empty((2, rows, most), np.int64),
+            np.empty((3, columns), np.int64), np.empty(2 * PLACES, np.int64), np.empty(most, np.int64),
+            np.empty((rows, most, 2)), np.empty((rows, most, 2, 2)), np.empty((rows, most)), np.empty((2, rows, most), np.int64),
             np.empty((PATHS_ALIVE, 2), np.int64),
         )  # fmt: skip
         self._rows = rows

@@ -15,8 +15,7 @@ from tests.scanning.pipeline.agreement import Steps, assert_agree, header_for
 from tests.scanning.pipeline.scenes import line, shot, speckle
 
 BRACKET = (100.0, 300.0, 500.0, 700.0, 900.0)
-LETTER = {"msnn.floor": "0.1", "msnn.floor_from": "zero", "msnn.ceiling": "0", "msnn.snr": "0",
-          "msnn.grain_px": "0", "msnn.seed": "first"}  # fmt: skip
+LETTER = {"msnn.reading": "literal"}
 
 
 def frames_of_any_kind(rng: np.random.Generator, kind: int, rows: int, columns: int, top: int) -> NDArray[Any]:
@@ -63,6 +62,9 @@ def anything(draw: st.DrawFn) -> tuple[Steps, tuple[float, ...], int, float, flo
         gate_px=draw(st.sampled_from([1.0, 4.0, 12.0])),
         gate_max_px=draw(st.sampled_from([12.0, 64.0])),
         seed=draw(st.sampled_from(["first", "best"])),
+        candidates=draw(st.sampled_from(["auto", "threshold", "noise"])),
+        continuity=draw(st.sampled_from(["auto", "nearest", "path"])),
+        jump=draw(st.sampled_from([0.0, 2.0, 10.0])),
     )
     recipe = Recipe("any", (*before, msnn, Centroid()))
     steps = draw(st.integers(sci.window if recipe.compound else 1, 10))

@@ -12,18 +12,7 @@ from scanning.pipeline.stream import extract_profile
 from scanning.recipe import Recipe
 from tests.scanning.pipeline.scenes import line, shot, speckle
 
-LETTER = Recipe.named("NF").with_settings(
-    {
-        "msnn.floor": "0.1",
-        "msnn.floor_from": "zero",
-        "msnn.ceiling": "0",
-        "msnn.snr": "0",
-        "msnn.grain_px": "0",
-        "msnn.seed": "first",
-        "msnn.width_factor": "100",
-        "msnn.k": "0.1",
-    }
-)
+LETTER = Recipe.named("NF").with_settings({"msnn.reading": "literal", "msnn.width_factor": "100", "msnn.k": "0.1"})
 
 
 def columns(*rows: list[int], recipe: Recipe = LETTER, width: float = 3.0) -> list[float]:
@@ -146,7 +135,9 @@ def test_a_ghost_where_the_line_has_ended_below_is_not_followed() -> None:
 def test_the_literal_seed_would_lose_that_frame() -> None:
     light = line(STRAIGHT, 256, 3.03, 60.0 * (ROWS < 280)) + line(STRAIGHT + 90.0, 256, 3.5, 120.0 * (ROWS > 310))
     rng = np.random.default_rng(11)
-    literal = Recipe.named("NF").with_settings({"msnn.seed": "first"})
+    literal = Recipe.named("NF").with_settings(
+        {"msnn.candidates": "threshold", "msnn.continuity": "nearest", "msnn.seed": "first"}
+    )
     found = extract_profile(shot(speckle(light, rng), rng), literal, dark_level=2, line_width_px=3.03)
     assert np.isnan(found[:280]).all()
 

@@ -75,7 +75,7 @@ def test_response_first_then_noise(
 
 
 def test_a_peak_to_the_letter_is_a_grain_and_fails_the_response(light: NDArray[np.float64]) -> None:
-    literal = Recipe.named("NF").with_settings({"msnn.grain_px": "0"})
+    literal = Recipe.named("NF").with_settings({"msnn.reading": "literal"})
     found = {}
     for shift in (0, 2):
         steps = recorded(light, shift, (60.0,))

@@ -42,6 +42,11 @@ class Setting:
     gate_max: float = 64.0
     snr: float = 4.0
     seed: str = "best"
+    candidates: str = "noise"
+    continuity: str = "path"
+    jump: float = 10.0
+    width_share: float = 0.5  # of its height: where a candidate standing out of the noise has its width
+    light_width: float = 3.0  # px, before GLT; 3 where nobody knows
 
 
 def quantised(grey: Array, window: int) -> Array:
@@ -119,10 +124,12 @@ class Peak:
     height: float
     left: float = 0.0
     right: float = 0.0
+    added: float = 0.0  # px^2 of the squared width that come from smoothing
+    halves: tuple[float, float] | None = None
 
     @property
     def width(self) -> float:
-        return self.right - self.left
+        return without_smoothing(self.right - self.left, self.added)
 
     @property
     def middle(self) -> float:
@@ -265,20 +272,170 @@ def noise_of(image: Array) -> float:
     return float(1.4826 / math.sqrt(2) * steps[len(steps) // 2])
 
 
+def without_smoothing(width: float, added: float) -> float:
+    return math.sqrt(max(width**2 - added, width**2 / 16))
+
+
+def smoothed(image: Array, box: int) -> Array:
+    """Three rows summed (the border's row counts twice), two boxes across the columns, darkness outside."""
+    tall = np.pad(image, ((1, 1), (0, 0)), mode="edge")
+    sums = tall[:-2] + tall[1:-1] + tall[2:]
+    for _ in range(2):
+        wide = np.pad(sums, ((0, 0), (box // 2, box // 2)))
+        sums = np.sum([wide[:, i : i + image.shape[1]] for i in range(box)], axis=0)
+    return sums
+
+
+def standing_out(image: Array, faint: float, s: Setting) -> list[list[Peak]]:
+    box = 3 if s.width is None else min(15, max(3, 2 * math.floor(s.width / 2) + 1))
+    added = 8 * math.log(2) * (box**2 - 1) / 6
+    soft = smoothed(image, box)
+    places = soft.size
+    columns = image.shape[1]
+    at = [divmod((i * 2654435761) % places, columns) for i in range(min(places, 1024))]
+    seen = sorted(soft[r, c] for r, c in at)
+    level = seen[len(seen) // 2]
+    steps = sorted(abs(soft[r, c] - soft[r, (c + 2 * box) % columns]) for r, c in at)
+    spread = 1.4826 / math.sqrt(2) * steps[len(steps) // 2]
+    reach = math.ceil(2.2 * s.light_width)
+    rows = []
+    for P, S in zip(image, soft, strict=True):  # noqa: N806
+        tops: list[int] = []
+        for a, b in flat_stretches(S):
+            up = a == 0 or S[a - 1] < S[a]
+            down = b == S.size - 1 or S[b + 1] < S[b]
+            if not (up and down and S[a] > level + s.snr * spread + 1e-9 * (level + 1)):
+                continue
+            top = (a + b) // 2
+            if tops:
+                last = tops[-1]
+                lower = min(S[last], S[top])
+                if top - last <= s.grain or S[last : top + 1].min() - level > 0.8 * (lower - level):
+                    tops[-1] = top if S[top] > S[last] else last
+                    continue
+            tops.append(top)
+        peaks = []
+        for n, top in enumerate(tops):
+            tall = S[top] - level
+            dim = max(level, S.mean()) if s.floor_from_row_mean else level
+            ends = max(level + 1.5 * spread, dim + s.floor * (S[top] - dim))
+            first = last = top
+            lowest, highest = top - reach, top + reach
+            if n > 0:
+                between = list(range(tops[n - 1] + 1, top + 1))
+                lowest = max(lowest, max(between, key=lambda i: (-S[i], i)))
+            if n + 1 < len(tops):
+                between = list(range(top, tops[n + 1]))
+                highest = min(highest, min(between, key=lambda i: (S[i], i)))
+            while first > max(lowest, 0) and S[first - 1] > ends:
+                first -= 1
+            while last < min(highest, S.size - 1) and S[last + 1] > ends:
+                last += 1
+            height = float(P[first : last + 1].max())
+            if height <= faint:
+                continue
+            half = level + tall * s.width_share
+            i = j = top
+            while i > max(lowest, 0) and S[i - 1] > half:
+                i -= 1
+            while j < min(highest, S.size - 1) and S[j + 1] > half:
+                j += 1
+            left, right = i - 0.5, j + 0.5
+            if i > 0 and S[i - 1] <= half:
+                left = i - (S[i] - half) / (S[i] - S[i - 1])
+            if j < S.size - 1 and S[j + 1] <= half:
+                right = j + (S[j] - half) / (S[j] - S[j + 1])
+            peaks.append(Peak(first, last, height, left, right, added, (top - left, right - top)))
+        rows.append(peaks)
+    return rows
+
+
+def flat_stretches(values: Array) -> list[tuple[int, int]]:
+    ends = [i for i in range(values.size) if i + 1 == values.size or values[i + 1] != values[i]]
+    return list(zip([0, *(e + 1 for e in ends[:-1])], ends, strict=True))
+
+
+def averaged_halves(rows: list[list[Peak]], s: Setting) -> list[list[tuple[float, float]]]:
+    """Half widths left and right of every candidate, averaged over its neighbours above and below."""
+
+    def own(peak: Peak) -> Array:
+        return np.array(peak.halves if peak.halves is not None else (peak.width / 2, peak.width / 2))
+
+    def one_way(order: list[int]) -> list[list[Array]]:
+        out: list[list[Array]] = [[] for _ in rows]
+        for n, r in enumerate(order):
+            for peak in rows[r]:
+                value = own(peak)
+                for q in order[max(0, n - 3) : n][::-1]:
+                    near = [(abs(p.middle - peak.middle), k) for k, p in enumerate(rows[q])]
+                    distance, k = s.light_width, -1
+                    for d, index in near:
+                        if d < distance - TIE:
+                            distance, k = d, index
+                    if k >= 0:
+                        value = 0.8 * out[q][k] + 0.2 * own(peak)
+                        break
+                out[r].append(value)
+        return out
+
+    down, up = one_way(list(range(len(rows)))), one_way(list(range(len(rows)))[::-1])
+    return [[tuple((a + b) / 2) for a, b in zip(d, u, strict=True)] for d, u in zip(down, up, strict=True)]
+
+
+def best_path(rows: list[list[Peak]], s: Setting) -> list[int]:
+    """Every candidate against every earlier one; latest row first, there the higher column first, wins a tie."""
+    earned: dict[tuple[int, int], float] = {}
+    averages = averaged_halves(rows, s)
+    highest = [max(p.height for p in peaks) for peaks in rows if peaks]
+    bright = sum(highest) / len(highest) / 4 if highest else 1.0
+    for r, peaks in enumerate(rows):
+        for k, peak in enumerate(peaks):
+            reward = 1.0
+            if s.width is not None:
+                one_side, both = 2 * min(averages[r][k]), sum(averages[r][k])
+                off = min(abs(math.log(without_smoothing(w, peak.added) / s.width)) for w in (one_side, both))
+                if s.width_factor == 1:
+                    reward = float(off < TIE)
+                else:
+                    reward = max(0.0, min(1.0, 2 * (1 - off / math.log(s.width_factor))))
+            if reward > 0:
+                earned[r, k] = reward * (0.9 + 0.1 * min(1.0, peak.height / bright))
+    def price(a: tuple[int, int], b: tuple[int, int]) -> float:
+        moved = abs(rows[a[0]][a[1]].middle - rows[b[0]][b[1]].middle)
+        if moved > s.gate_max + TIE:
+            return math.inf
+        return min(moved / s.light_width, s.jump + 0.1 * moved / s.light_width)
+
+    score: dict[tuple[int, int], float] = {}
+    before: dict[tuple[int, int], tuple[int, int] | None] = {}
+    alive: list[tuple[int, int]] = []
+    for r in range(len(rows)):
+        here = [key for key in earned if key[0] == r]
+        for key in here:
+            score[key], before[key] = earned[key], None
+            for other in sorted(alive, reverse=True):
+                through = score[other] + earned[key] - price(other, key)
+                if through > score[key] + TIE:
+                    score[key], before[key] = through, other
+        alive = [a for a in alive if all(score[key] - price(key, a) < score[a] for key in here)] + here
+    chosen = [-1] * len(rows)
+    at: tuple[int, int] | None = None
+    for key in sorted(score):
+        if at is None or score[key] > score[at] + TIE:
+            at = key
+    while at is not None:
+        chosen[at[0]] = at[1]
+        at = before[at]
+    return chosen
+
+
 def profile(image: Array, s: Setting) -> Array:
     """MSNN and eq. (8) on one image whose black level is off; NaN where there is no line."""
     faint = s.snr * noise_of(image) * STRICT
     image = np.maximum(image, 0.0)
-    maxima = image.max(axis=1)
-    asked = s.k * image.mean()
-    if s.ceiling > 0:
-        asked = min(asked, s.ceiling * maxima.mean())
-    rows = []
-    for P in image:  # noqa: N806
-        background = P.mean() if s.floor_from_row_mean else 0.0
-        rows.append(peaks_of_row(P, max(asked, background + s.floor * (P.max() - background)), faint, s))
+    rows = standing_out(image, faint, s) if s.candidates == "noise" else above_threshold(image, faint, s)
     out = np.full(len(rows), np.nan)
-    for r, k in enumerate(the_line(rows, s)):
+    for r, k in enumerate(best_path(rows, s) if s.continuity == "path" else the_line(rows, s)):
         if k >= 0:
             mask = np.zeros(image.shape[1])
             mask[rows[r][k].first : rows[r][k].last + 1] = 1
@@ -287,6 +444,18 @@ def profile(image: Array, s: Setting) -> Array:
             if light > 0:
                 out[r] = (columns * image[r] * mask).sum() / light
     return out
+
+
+def above_threshold(image: Array, faint: float, s: Setting) -> list[list[Peak]]:
+    maxima = image.max(axis=1)
+    asked = s.k * image.mean()
+    if s.ceiling > 0:
+        asked = min(asked, s.ceiling * maxima.mean())
+    rows = []
+    for P in image:  # noqa: N806
+        background = P.mean() if s.floor_from_row_mean else 0.0
+        rows.append(peaks_of_row(P, max(asked, background + s.floor * (P.max() - background)), faint, s))
+    return rows
 
 
 def range_columns(stack: list[list[NDArray[Any]]], s: Setting) -> Array:

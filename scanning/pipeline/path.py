@@ -1,0 +1,163 @@
+"""The line as the best path through the candidates of all rows.
+
+Following the nearest candidate from row to row cannot turn back: once on a reflection it stays there. Seen over the
+whole image the line is what is as wide as the line, in most rows, with few jumps. That is a path of least cost, and
+dynamic programming finds the best of all paths in one pass, without a seed, from both sides at once.
+
+A path takes at most one candidate per row. Each candidate taken earns its likeness: 1 at the line's width, falling to
+0 where the width check ends; one that fails it earns nothing and is never taken. A tenth of it goes by the light. Speckle scatters the width of a single
+row from half to twice the line's, so widths are averaged (their logarithm, fading over about five rows each way) along
+neighbours within a line width: a reflection is too wide in all its rows, the line only by chance.
+Between one candidate and the next of the path, d line widths to the side cost min(STIFF d, jump + FAR d): a bend costs
+what it bends; a step of the surface, a damage or a reflection costs a jump; further than gate_max_px nothing
+goes, because where the line has ended a reflection far away is no line. Rows in between cost nothing, whether damage,
+darkness or reflection fills them.
+
+A path is forgotten as soon as a path of a later row is so much better that coming over from that one to where it stands
+costs less than it is behind: the cost is concave in d, so it could not win again. A handful of paths stay alive.
+"""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+
+TIE = 1e-9
+FADING = 0.8
+"""Share of the width average that the next row keeps."""
+ROWS_BACK = 3
+"""A candidate's neighbour may be missing in up to two rows."""
+STIFF = 1.0
+"""Reward lost per line width moved to the side."""
+FAR = 0.1
+BY_LIGHT = 0.1
+"""This share of the reward depends on the light: of two equal paths the brighter one is the line."""
+BRIGHT = 0.25
+"""A candidate is bright from this share of the mean highest candidate on."""
+
+
+@nb.njit(cache=True, nogil=True)
+def average_halves(counts, shape, half, near, average):  # type: ignore[no-untyped-def]
+    """Write average (rows, peaks, side, direction): half widths averaged over the rows above, over those below."""
+    rows = counts.size
+    for direction in range(2):
+        towards = 1 if direction == 0 else -1
+        for i in range(rows):
+            r = i if direction == 0 else rows - 1 - i
+            for k in range(counts[r]):
+                left, right = half[r, k, 0], half[r, k, 1]
+                nearest = near
+                for back in range(1, ROWS_BACK + 1):
+                    q = r - towards * back
+                    if q < 0 or q >= rows:
+                        break
+                    for p in range(counts[q]):
+                        moved = abs(shape[q, p, 0] - shape[r, k, 0])
+                        if moved < nearest - TIE:
+                            nearest = moved
+                            left = FADING * average[q, p, 0, direction] + (1.0 - FADING) * half[r, k, 0]
+                            right = FADING * average[q, p, 1, direction] + (1.0 - FADING) * half[r, k, 1]
+                    if nearest < near:
+                        break
+                average[r, k, 0, direction] = left
+                average[r, k, 1, direction] = right
+
+
+@nb.njit(cache=True, nogil=True)
+def likeness(average, widened, expected, factor):  # type: ignore[no-untyped-def]
+    """How much a candidate looks like the line, 1 to 0, from its averaged halves (side, direction) in px."""
+    left = 0.5 * (average[0, 0] + average[0, 1])
+    right = 0.5 * (average[1, 0] + average[1, 1])
+    return max(
+        likeness_of(2.0 * min(left, right), widened, expected, factor),
+        likeness_of(left + right, widened, expected, factor),
+    )
+
+
+@nb.njit(cache=True, nogil=True)
+def likeness_of(width, widened, expected, factor):  # type: ignore[no-untyped-def]
+    """The same of one width."""
+    width = np.sqrt(max(width * width - widened, 0.0625 * width * width))
+    off = abs(np.log(width / expected))
+    if factor <= 1.0:
+        return 1.0 if off < TIE else 0.0
+    return max(0.0, min(1.0, 2.0 * (1.0 - off / np.log(factor))))
+
+
+@nb.njit(cache=True, nogil=True)
+def mean_of_highest(counts, height):  # type: ignore[no-untyped-def]
+    """Mean over the rows with a candidate of its highest one's light."""
+    total, rows = 0.0, 0
+    for r in range(counts.size):
+        if counts[r] > 0:
+            total += height[r, : counts[r]].max()
+            rows += 1
+    return total / rows if rows > 0 else 1.0
+
+
+@nb.njit(cache=True, nogil=True)
+def cost(moved, width, jump, furthest):  # type: ignore[no-untyped-def]
+    """What it costs to go ``moved`` px to the side."""
+    if moved > furthest + TIE:
+        return np.inf
+    widths = moved / width
+    return min(STIFF * widths, jump + FAR * widths)
+
+
+@nb.njit(cache=True, nogil=True)
+def find_path(  # type: ignore[no-untyped-def]
+    counts, shape, half, height, widened, expected, factor, width, jump, furthest, average, score, back_row, back_peak, alive, chosen
+):
+    """Choose the candidate of every row that is on the best path, -1 where there is none.
+
+    ``expected`` width (px) as the image shows it and the factor it may be off (inf: any); ``width`` of the light, the
+    unit of moving. ``average, score, back_row, back_peak, alive`` are scratch.
+    """
+    rows = counts.size
+    chosen[:] = -1
+    judged = np.isfinite(factor)
+    if judged:
+        average_halves(counts, shape, half, width, average)
+    bright = BRIGHT * mean_of_highest(counts, height)
+    best, end_row, end_peak = 0.0, -1, -1
+    living = 0
+    for r in range(rows):
+        fresh = living
+        for k in range(counts[r]):
+            earned = 1.0
+            if judged:
+                earned = likeness(average[r, k], widened, expected, factor)
+            if earned <= 0.0:
+                continue
+            earned *= 1.0 - BY_LIGHT + BY_LIGHT * min(1.0, height[r, k] / bright)
+            value, from_row, from_peak = earned, -1, -1
+            for s in range(living - 1, -1, -1):  # the latest first: it wins a tie
+                q, p = alive[s, 0], alive[s, 1]
+                through = score[q, p] + earned - cost(abs(shape[r, k, 0] - shape[q, p, 0]), width, jump, furthest)
+                if through > value + TIE:
+                    value, from_row, from_peak = through, q, p
+            score[r, k] = value
+            back_row[r, k], back_peak[r, k] = from_row, from_peak
+            if value > best + TIE:
+                best, end_row, end_peak = value, r, k
+            if fresh < alive.shape[0]:
+                alive[fresh, 0], alive[fresh, 1] = r, k
+                fresh += 1
+        # Forget what can be reached more cheaply by coming over from this row.
+        kept = 0
+        for s in range(fresh):
+            q, p = alive[s, 0], alive[s, 1]
+            keep = True
+            if s < living:
+                for n in range(living, fresh):
+                    over = cost(abs(shape[alive[n, 0], alive[n, 1], 0] - shape[q, p, 0]), width, jump, furthest)
+                    if score[alive[n, 0], alive[n, 1]] - over >= score[q, p]:
+                        keep = False
+                        break
+            if keep:
+                alive[kept, 0], alive[kept, 1] = q, p
+                kept += 1
+        living = kept
+    while end_row >= 0:
+        chosen[end_row] = end_peak
+        end_row, end_peak = back_row[end_row, end_peak], back_peak[end_row, end_peak]
