@@ -102,10 +102,11 @@ class Line:
     row: gate_px (1 + rows missed), at most gate_max_px. ``seed``: ``first`` follows the line from the first good row
     from the bottom; ``best`` also tries others and takes the line most like the line.
     ``candidates``: "noise" takes everything ``snr`` spreads above the noise (standing_out.py; k, floor_from and ceiling
-    are not used, ``floor`` is the share of its own height at which a candidate's base ends), "threshold" the peaks above
-    the paper's threshold. ``continuity``: "path" is the best path through the candidates of all rows (path.py; gate_px,
-    and seed are not used), ``jump`` its price of a jump, in rows; "nearest" follows the nearest candidate. "auto" is
-    noise and path, but threshold and nearest for lines wider than 12 px, whose background is structure and not noise.
+    are not used, ``floor`` is the share of its own height at which a candidate's base ends), "threshold" the peaks
+    above the paper's threshold. ``continuity``: "path" is the best path through the candidates of all rows (path.py;
+    gate_px and seed are not used), ``jump`` its price of a jump, in rows; "nearest" follows the nearest candidate.
+    "auto" is noise and path, but threshold and nearest for lines wider than 12 px: there structure is around the line,
+    not noise.
     `LITERAL`, or the setting ``msnn.reading=literal``, is the paper to the letter.
     """
 

@@ -1,16 +1,43 @@
 """The paper's pipeline, one file per operation, in the order the data flows.
 
-compound.py (SCI), exposure.py (HDRE), tone.py (GLT), line.py (MSNN), centroid.py (COG); stream.py composes them.
+compound.py (SCI), exposure.py (HDRE), tone.py (GLT), line.py (MSNN, with standing_out.py and path.py), centroid.py
+(COG); stream.py composes them.
+
+Compiled kernels are kept under a name made of all the sources here. Numba itself looks only at the file a kernel is
+written in: after an update that changed a kernel called from another file it would go on using the old one, and give
+the old numbers.
 """
 
 from __future__ import annotations
 
+import hashlib
+import os
 from collections.abc import Callable
+from pathlib import Path
 
+import numba
 import numpy as np
 
 from scanning.frames import StackHeader
 from scanning.recipe import Recipe
+
+
+def _cache_for_these_sources() -> None:
+    here = Path(__file__).parent
+    sources = hashlib.sha256(b"".join(file.read_bytes() for file in sorted(here.glob("*.py")))).hexdigest()[:16]
+    places = [Path(os.environ.get("NUMBA_CACHE_DIR") or here / "__pycache__"), Path.home() / ".cache" / "edgewatch"]
+    for place in places:
+        kept = place / f"kernels-{sources}"
+        try:
+            kept.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            continue
+        if os.access(kept, os.W_OK):
+            numba.config.CACHE_DIR = str(kept)  # type: ignore[attr-defined]
+            return
+
+
+_cache_for_these_sources()
 
 
 def warm_up(progress: Callable[[int, int], None] | None = None) -> None:

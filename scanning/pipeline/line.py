@@ -336,23 +336,23 @@ def candidates_by_threshold(  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def candidates_by_noise(  # type: ignore[no-untyped-def]
-    image, top, scale, dark, floor, from_row_mean, width_share, snr, faint, grain_px, reach, box, three, once, smooth, seen, maxima, base, shape,
-    half, height, counts,
+    image, top, scale, dark, floor, from_row_mean, snr, faint, grain_px, reach, box, three, once, smooth, seen, maxima,
+    base, shape, half, height, counts,
 ):  # fmt: skip
     """What stands out of the noise in every row; see standing_out.py."""
     level, spread = level_and_spread(image, box, top, scale, dark, seen)
     for r in range(image.shape[0]):
         smooth_row(image, r, box, top, scale, dark, three, once, smooth)
         counts[r] = row_candidates(
-            image[r], smooth, level, spread, snr, faint, floor, from_row_mean, width_share, grain_px, reach, box, top, scale,
-            dark, maxima, base[r], shape[r], half[r], height[r],
+            image[r], smooth, level, spread, snr, faint, floor, from_row_mean, grain_px, reach, box, top, scale, dark,
+            maxima, base[r], shape[r], half[r], height[r],
         )  # fmt: skip
 
 
 @nb.njit(cache=True, nogil=True)
 def extract_line(  # type: ignore[no-untyped-def]
     image, top, scale, dark, by_noise, by_path, k, floor, from_row_mean, ceiling, snr, grain_px, expected, factor,
-    gate_px, gate_max_px, best_seed, light_width, jump, reach, box, width_share,
+    gate_px, gate_max_px, best_seed, light_width, jump, reach, box,
     highest, light, base, shape, height, counts, chosen, rows_of, seen, maxima, half, average, score, back, alive,
     column_px, peak, width_px,
 ):  # fmt: skip
@@ -365,8 +365,8 @@ def extract_line(  # type: ignore[no-untyped-def]
     faint = snr * noise_of(image, top, scale) * STRICT if snr > 0.0 else 0.0
     if by_noise:
         candidates_by_noise(
-            image, top, scale, dark, floor, from_row_mean, width_share, snr, faint, grain_px, reach, box, rows_of[0], rows_of[1], rows_of[2], seen,
-            maxima, base, shape, half, height, counts,
+            image, top, scale, dark, floor, from_row_mean, snr, faint, grain_px, reach, box, rows_of[0], rows_of[1],
+            rows_of[2], seen, maxima, base, shape, half, height, counts,
         )  # fmt: skip
     else:
         candidates_by_threshold(
@@ -381,8 +381,8 @@ def extract_line(  # type: ignore[no-untyped-def]
                 for p in range(counts[r]):
                     half[r, p, :] = 0.5 * shape[r, p, 1]
         find_path(
-            counts, shape, half, height, widened, expected, factor, light_width, jump, gate_max_px, average, score, back[0], back[1], alive,
-            chosen,
+            counts, shape, half, height, widened, expected, factor, light_width, jump, gate_max_px, average, score,
+            back[0], back[1], alive, chosen,
         )  # fmt: skip
     else:
         find_line(counts, shape, height, expected, factor, gate_px, gate_max_px, best_seed, chosen)

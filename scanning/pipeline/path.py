@@ -5,9 +5,10 @@ whole image the line is what is as wide as the line, in most rows, with few jump
 dynamic programming finds the best of all paths in one pass, without a seed, from both sides at once.
 
 A path takes at most one candidate per row. Each candidate taken earns its likeness: 1 at the line's width, falling to
-0 where the width check ends; one that fails it earns nothing and is never taken. A tenth of it goes by the light. Speckle scatters the width of a single
-row from half to twice the line's, so widths are averaged (their logarithm, fading over about five rows each way) along
-neighbours within a line width: a reflection is too wide in all its rows, the line only by chance.
+0 where the width check ends; one that fails it earns nothing and is never taken. A tenth of it goes by the light.
+Speckle scatters the width of a single row from half to twice the line's, so widths are averaged (fading over about five
+rows each way) along neighbours within a line width: a reflection is too wide in all its rows, the line only by chance.
+A reflection that touches the line widens it on one side only, so twice the narrower half may pass as the width too.
 Between one candidate and the next of the path, d line widths to the side cost min(STIFF d, jump + FAR d): a bend costs
 what it bends; a step of the surface, a damage or a reflection costs a jump; further than gate_max_px nothing
 goes, because where the line has ended a reflection far away is no line. Rows in between cost nothing, whether damage,
@@ -106,8 +107,9 @@ def cost(moved, width, jump, furthest):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def find_path(  # type: ignore[no-untyped-def]
-    counts, shape, half, height, widened, expected, factor, width, jump, furthest, average, score, back_row, back_peak, alive, chosen
-):
+    counts, shape, half, height, widened, expected, factor, width, jump, furthest, average, score, back_row, back_peak,
+    alive, chosen,
+):  # fmt: skip
     """Choose the candidate of every row that is on the best path, -1 where there is none.
 
     ``expected`` width (px) as the image shows it and the factor it may be off (inf: any); ``width`` of the light, the

@@ -16,7 +16,7 @@ candidates in 60 % of the rows beside a reflection). Noise is the same in every 
    the noise, to the valley before the next candidate, and no further
    than ``reach`` columns. It is found in the smoothed light, so no single grain decides where it ends.
 
-Width is the full width of the smoothed light at ``width_share`` of its height, less what the smoothing added.
+Width is the full width at half maximum of the smoothed light, less what the smoothing added.
 """
 
 from __future__ import annotations
@@ -122,13 +122,13 @@ def level_and_spread(image, box, top, scale, dark, seen):  # type: ignore[no-unt
 
 @nb.njit(cache=True, nogil=True)
 def row_candidates(  # type: ignore[no-untyped-def]
-    row, smooth, level, spread, snr, faint, floor, from_row_mean, width_share, grain_px, reach, box, top, scale, dark, maxima,
-    base, shape, half, height,
+    row, smooth, level, spread, snr, faint, floor, from_row_mean, grain_px, reach, box, top, scale, dark, maxima, base,
+    shape, half, height,
 ):  # fmt: skip
     """Candidates of one row, from low to high columns; return how many.
 
     Written per candidate: base (first, last), shape (position, width) in px, half (from the maximum to
-    where the width is taken on the left, on the right; px, as smoothed), height in light of the row itself.
+    half height on the left, on the right; px, as smoothed), height in light of the row itself.
     """
     columns = row.size
     limit = level + snr * spread
@@ -173,7 +173,7 @@ def row_candidates(  # type: ignore[no-untyped-def]
         m = maxima[k]
         tall = float(smooth[m] - level)
         ends = max(foot, background + floor * (smooth[m] - background))
-        middle_level = level + width_share * tall
+        middle_level = level + 0.5 * tall
         lowest, highest = max(0, m - reach), min(columns - 1, m + reach)
         if k > 0:
             valley = m

@@ -348,14 +348,12 @@ class _Chain:
 
         width = settled.expected_width_px
         unit = line.width_px or settled.line_width_px or GRAIN_PX
-        by_noise = settled.candidates == "noise"
-        share = 0.5
         box = box_for(width)
         self._line = (
-            by_noise, settled.continuity == "path", settled.k, settled.floor, line.floor_from == "row_mean", line.ceiling, settled.snr,
-            settled.grain_px,
+            settled.candidates == "noise", settled.continuity == "path", settled.k, settled.floor,
+            line.floor_from == "row_mean", line.ceiling, settled.snr, settled.grain_px,
             1.0 if width is None else width, np.inf if width is None else line.width_factor,
-            line.gate_px, line.gate_max_px, line.seed == "best", unit, line.jump, math.ceil(REACH * unit), box, share,
+            line.gate_px, line.gate_max_px, line.seed == "best", unit, line.jump, math.ceil(REACH * unit), box,
         )  # fmt: skip
         most = columns // 2 + 1
         self._scratch = (  # light, base, shape, height, counts, chosen, and for noise and path: see their files
@@ -363,8 +361,8 @@ class _Chain:
             np.empty((rows, most, 2), np.int64), np.empty((rows, most, 2)), np.empty((rows, most), np.int64),
             np.zeros(rows, np.int64), np.empty(rows, np.int64),
             np.empty((3, columns), np.int64), np.empty(2 * PLACES, np.int64), np.empty(most, np.int64),
-            np.empty((rows, most, 2)), np.empty((rows, most, 2, 2)), np.empty((rows, most)), np.empty((2, rows, most), np.int64),
-            np.empty((PATHS_ALIVE, 2), np.int64),
+            np.empty((rows, most, 2)), np.empty((rows, most, 2, 2)), np.empty((rows, most)),
+            np.empty((2, rows, most), np.int64), np.empty((PATHS_ALIVE, 2), np.int64),
         )  # fmt: skip
         self._rows = rows
 

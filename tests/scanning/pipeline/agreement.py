@@ -59,7 +59,6 @@ def reference(steps: Steps, header: StackHeader, recipe: Recipe) -> NDArray[np.f
     if width is None and header.line_width_px is not None:
         width = header.line_width_px * (broadening(glt.p) if glt is not None else 1.0)
     light_width = line.width_px or header.line_width_px or 3.0
-    share = 0.5
     floor = line.floor
     if floor is None and glt is not None:
         floor = (math.log(0.05 * 64 + 1) / math.log(65)) ** glt.p
@@ -91,7 +90,6 @@ def reference(steps: Steps, header: StackHeader, recipe: Recipe) -> NDArray[np.f
         continuity=line.continuity if line.continuity != "auto" else ("nearest" if light_width > 12 else "path"),
         jump=line.jump,
         light_width=light_width,
-        width_share=share,
     )
     return range_columns(steps, setting)
 

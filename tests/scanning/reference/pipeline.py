@@ -45,7 +45,6 @@ class Setting:
     candidates: str = "noise"
     continuity: str = "path"
     jump: float = 10.0
-    width_share: float = 0.5  # of its height: where a candidate standing out of the noise has its width
     light_width: float = 3.0  # px, before GLT; 3 where nobody knows
 
 
@@ -334,7 +333,7 @@ def standing_out(image: Array, faint: float, s: Setting) -> list[list[Peak]]:
             height = float(P[first : last + 1].max())
             if height <= faint:
                 continue
-            half = level + tall * s.width_share
+            half = level + tall / 2
             i = j = top
             while i > max(lowest, 0) and S[i - 1] > half:
                 i -= 1
