@@ -91,7 +91,8 @@ class Line:
 
     ``k``: threshold as a multiple of the mean of the image; None means 3, or 1.5 on compressed grey (after GLT, or
     from a logarithmic camera). ``floor``: the threshold is never under this share of the row's maximum; None means
-    0.1, after GLT what 0.05 of the light became (0.59 at p = 0.5), 0.6 from a logarithmic camera.
+    0.1, after GLT what 0.05 of the light became (0.59 at p = 0.5), 0.6 from a logarithmic camera; with candidates by
+    noise 0.02, and after GLT what 0.02 of the light became.
     The share counts from the row's mean (``floor_from`` "row_mean") or from "zero".
     ``ceiling``: the image mean asks for no more than this share of the mean row maximum (0: no ceiling).
     ``snr``: a peak must be higher than this many standard deviations of a pixel's noise; None means 4, or 3 on
@@ -102,8 +103,9 @@ class Line:
     row: gate_px (1 + rows missed), at most gate_max_px. ``seed``: ``first`` follows the line from the first good row
     from the bottom; ``best`` also tries others and takes the line most like the line.
     ``candidates``: "noise" takes everything ``snr`` spreads above the noise (standing_out.py; k, floor_from and ceiling
-    are not used, ``floor`` is the share of its own height at which a candidate's base ends), "threshold" the peaks
-    above the paper's threshold. ``continuity``: "path" is the best path through the candidates of all rows (path.py;
+    are not used, ``floor`` is the share of its own height at which a base ends; the centre of gravity is that of the
+    light above this level, so that a base of whole pixels does not hold the line back), "threshold" the peaks above the
+    paper's threshold. ``continuity``: "path" is the best path through the candidates of all rows (path.py;
     gate_px and seed are not used), ``jump`` its price of a jump, in rows; "nearest" follows the nearest candidate.
     "auto" is noise and path, but threshold and nearest for lines wider than 12 px: there structure is around the line,
     not noise.

@@ -34,7 +34,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from scanning.pipeline.centroid import centre_of_gravity
+from scanning.pipeline.centroid import centre_above, centre_of_gravity
 from scanning.pipeline.grey import grey
 from scanning.pipeline.path import find_path
 from scanning.pipeline.standing_out import BOX_WIDENS, level_and_spread, row_candidates, smooth_row
@@ -337,7 +337,7 @@ def candidates_by_threshold(  # type: ignore[no-untyped-def]
 @nb.njit(cache=True, nogil=True)
 def candidates_by_noise(  # type: ignore[no-untyped-def]
     image, top, scale, dark, floor, from_row_mean, snr, faint, grain_px, reach, box, three, once, smooth, seen, maxima,
-    base, shape, half, height, counts,
+    base, shape, half, height, pedestal, counts,
 ):  # fmt: skip
     """What stands out of the noise in every row; see standing_out.py."""
     level, spread = level_and_spread(image, box, top, scale, dark, seen)
@@ -345,7 +345,7 @@ def candidates_by_noise(  # type: ignore[no-untyped-def]
         smooth_row(image, r, box, top, scale, dark, three, once, smooth)
         counts[r] = row_candidates(
             image[r], smooth, level, spread, snr, faint, floor, from_row_mean, grain_px, reach, box, top, scale, dark,
-            maxima, base[r], shape[r], half[r], height[r],
+            maxima, base[r], shape[r], half[r], height[r], pedestal[r],
         )  # fmt: skip
 
 
@@ -353,7 +353,8 @@ def candidates_by_noise(  # type: ignore[no-untyped-def]
 def extract_line(  # type: ignore[no-untyped-def]
     image, top, scale, dark, by_noise, by_path, k, floor, from_row_mean, ceiling, snr, grain_px, expected, factor,
     gate_px, gate_max_px, best_seed, light_width, jump, reach, box,
-    highest, light, base, shape, height, counts, chosen, rows_of, seen, maxima, half, average, score, back, alive,
+    highest, light, base, shape, height, counts, chosen, rows_of, seen, maxima, half, pedestal, average, score, back,
+    alive,
     column_px, peak, width_px,
 ):  # fmt: skip
     """MSNN then COG on one (rows, columns) image of integer codes (see `grey.grey` for top, scale, dark).
@@ -366,7 +367,7 @@ def extract_line(  # type: ignore[no-untyped-def]
     if by_noise:
         candidates_by_noise(
             image, top, scale, dark, floor, from_row_mean, snr, faint, grain_px, reach, box, rows_of[0], rows_of[1],
-            rows_of[2], seen, maxima, base, shape, half, height, counts,
+            rows_of[2], seen, maxima, base, shape, half, height, pedestal, counts,
         )  # fmt: skip
     else:
         candidates_by_threshold(
@@ -394,6 +395,9 @@ def extract_line(  # type: ignore[no-untyped-def]
             width_px[r] = np.nan
         else:
             first, last = base[r, peak_of_row, 0], base[r, peak_of_row, 1]
-            column_px[r] = centre_of_gravity(image[r], first, last, top, scale, dark)
+            if by_noise:
+                column_px[r] = centre_above(image[r], first, last, pedestal[r, peak_of_row], top, scale, dark)
+            else:
+                column_px[r] = centre_of_gravity(image[r], first, last, top, scale, dark)
             peak[r] = height[r, peak_of_row]
             width_px[r] = shape[r, peak_of_row, 1]

@@ -123,12 +123,12 @@ def level_and_spread(image, box, top, scale, dark, seen):  # type: ignore[no-unt
 @nb.njit(cache=True, nogil=True)
 def row_candidates(  # type: ignore[no-untyped-def]
     row, smooth, level, spread, snr, faint, floor, from_row_mean, grain_px, reach, box, top, scale, dark, maxima, base,
-    shape, half, height,
+    shape, half, height, pedestal,
 ):  # fmt: skip
     """Candidates of one row, from low to high columns; return how many.
 
     Written per candidate: base (first, last), shape (position, width) in px, half (from the maximum to
-    half height on the left, on the right; px, as smoothed), height in light of the row itself.
+    half height on the left, on the right; px, as smoothed), height and pedestal in light of the row itself.
     """
     columns = row.size
     limit = level + snr * spread
@@ -215,6 +215,7 @@ def row_candidates(  # type: ignore[no-untyped-def]
         shape[kept, 0] = 0.5 * (left + right)
         shape[kept, 1] = np.sqrt(max(width * width - widened, 0.0625 * width * width))
         half[kept, 0], half[kept, 1] = m - left, right - m
+        pedestal[kept] = ends / (3.0 * box * box)
         height[kept] = most
         kept += 1
     return kept

@@ -33,6 +33,8 @@ from scanning.rig.protocols import Image
 FIRST_STEPS = 5
 """Stage positions looked at before the first profile when something must be estimated."""
 RAW_FLOOR = 0.1
+FOOT_FLOOR = 0.02
+"""Where the base of a candidate standing out of the noise ends: this share of its own light."""
 LOGARITHMIC_FLOOR = 0.6
 RAW_SNR, COMPRESSED_SNR = 4.0, 3.0
 GRAIN_PX = 3.0
@@ -222,12 +224,6 @@ class ProfileStream:
             selected = [0 if self.recipe.exposure == "auto" else h.exposures_us.index(float(self.recipe.exposure))]
         compressed = self.recipe.tone is not None or h.response == "logarithmic"
         k = line.k if line.k is not None else (1.5 if compressed else 3.0)
-        floor = line.floor
-        if floor is None:
-            if self.recipe.tone is not None:
-                floor = light_share(RAW_FLOOR / 2.0, self.recipe.tone.p)
-            else:
-                floor = RAW_FLOOR if h.response == "linear" else LOGARITHMIC_FLOOR
         width = h.line_width_px
         if self._measures_width():
             estimated.append("line_width_px")
@@ -239,6 +235,14 @@ class ProfileStream:
         if expected is None and width is not None:
             expected = width * broadening(self.recipe.tone.p) if self.recipe.tone is not None else width
         wide = (line.width_px or width or 0.0) > WIDE_PX
+        candidates = line.candidates if line.candidates != "auto" else ("threshold" if wide else "noise")
+        floor = line.floor
+        if floor is None:
+            share = FOOT_FLOOR if candidates == "noise" else RAW_FLOOR
+            if self.recipe.tone is not None:
+                floor = light_share(share if candidates == "noise" else RAW_FLOOR / 2.0, self.recipe.tone.p)
+            else:
+                floor = share if h.response == "linear" else LOGARITHMIC_FLOOR
         self.settled = Settled(
             exposures_us=tuple(h.exposures_us[e] for e in selected),
             dark_levels=tuple(darks[e] for e in selected),
@@ -250,7 +254,7 @@ class ProfileStream:
             grain_px=line.grain_px
             if line.grain_px is not None
             else max(GRAIN_PX, (line.width_px or width or 0.0) / 4.0),
-            candidates=line.candidates if line.candidates != "auto" else ("threshold" if wide else "noise"),
+            candidates=candidates,
             continuity=line.continuity if line.continuity != "auto" else ("nearest" if wide else "path"),
             estimated=tuple(estimated),
         )
@@ -361,7 +365,7 @@ class _Chain:
             np.empty((rows, most, 2), np.int64), np.empty((rows, most, 2)), np.empty((rows, most), np.int64),
             np.zeros(rows, np.int64), np.empty(rows, np.int64),
             np.empty((3, columns), np.int64), np.empty(2 * PLACES, np.int64), np.empty(most, np.int64),
-            np.empty((rows, most, 2)), np.empty((rows, most, 2, 2)), np.empty((rows, most)),
+            np.empty((rows, most, 2)), np.empty((rows, most)), np.empty((rows, most, 2, 2)), np.empty((rows, most)),
             np.empty((2, rows, most), np.int64), np.empty((PATHS_ALIVE, 2), np.int64),
         )  # fmt: skip
         self._rows = rows

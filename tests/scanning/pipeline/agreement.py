@@ -59,11 +59,13 @@ def reference(steps: Steps, header: StackHeader, recipe: Recipe) -> NDArray[np.f
     if width is None and header.line_width_px is not None:
         width = header.line_width_px * (broadening(glt.p) if glt is not None else 1.0)
     light_width = line.width_px or header.line_width_px or 3.0
+    candidates = line.candidates if line.candidates != "auto" else ("threshold" if light_width > 12 else "noise")
     floor = line.floor
     if floor is None and glt is not None:
-        floor = (math.log(0.05 * 64 + 1) / math.log(65)) ** glt.p
+        share = 0.02 if candidates == "noise" else 0.05
+        floor = (math.log(share * 64 + 1) / math.log(65)) ** glt.p
     elif floor is None:
-        floor = 0.6 if header.response == "logarithmic" else 0.1
+        floor = 0.6 if header.response == "logarithmic" else (0.02 if candidates == "noise" else 0.1)
     setting = Setting(
         order=tuple(o.key for o in recipe.operations if o.key in ("sci", "hdre", "glt")),
         exposures=header.exposures_us,
@@ -86,7 +88,7 @@ def reference(steps: Steps, header: StackHeader, recipe: Recipe) -> NDArray[np.f
         gate=line.gate_px,
         gate_max=line.gate_max_px,
         seed=line.seed,
-        candidates=line.candidates if line.candidates != "auto" else ("threshold" if light_width > 12 else "noise"),
+        candidates=candidates,
         continuity=line.continuity if line.continuity != "auto" else ("nearest" if light_width > 12 else "path"),
         jump=line.jump,
         light_width=light_width,

@@ -125,6 +125,7 @@ class Peak:
     right: float = 0.0
     added: float = 0.0  # px^2 of the squared width that come from smoothing
     halves: tuple[float, float] | None = None
+    pedestal: float = 0.0
 
     @property
     def width(self) -> float:
@@ -344,7 +345,7 @@ def standing_out(image: Array, faint: float, s: Setting) -> list[list[Peak]]:
                 left = i - (S[i] - half) / (S[i] - S[i - 1])
             if j < S.size - 1 and S[j + 1] <= half:
                 right = j + (S[j] - half) / (S[j] - S[j + 1])
-            peaks.append(Peak(first, last, height, left, right, added, (top - left, right - top)))
+            peaks.append(Peak(first, last, height, left, right, added, (top - left, right - top), ends / (3 * box**2)))
         rows.append(peaks)
     return rows
 
@@ -439,9 +440,9 @@ def profile(image: Array, s: Setting) -> Array:
             mask = np.zeros(image.shape[1])
             mask[rows[r][k].first : rows[r][k].last + 1] = 1
             columns = np.arange(image.shape[1])
-            light = (image[r] * mask).sum()
-            if light > 0:
-                out[r] = (columns * image[r] * mask).sum() / light
+            weight = np.maximum(image[r] - rows[r][k].pedestal, 0.0) * mask
+            if weight.sum() > 0:
+                out[r] = (columns * weight).sum() / weight.sum()
     return out
 
 
