@@ -28,6 +28,8 @@ from scanning.errors import BadInput
 
 FORMAT = "edgewatch-calibration/1"
 FEWEST_PAIRS = 3
+STEEPEST_MM_PER_PX = 10.0
+"""As for a stack's mm_per_pixel: heights written in um give 14 on IS1 and would pass for a good line."""
 HEIGHT = "height_mm"
 COLUMN = "column_px"
 
@@ -238,6 +240,11 @@ def calibrate(
     left_out_um = 1000.0 * fit.leave_one_out
     if fit.slope == 0.0 or not (math.isfinite(fit.slope) and math.isfinite(fit.u_slope)):
         raise BadInput(f"{where}: no line fits (slope {fit.slope} mm/px); check that heights are in mm, columns in px")
+    if abs(fit.slope) > STEEPEST_MM_PER_PX:
+        raise BadInput(
+            f"{where}: the slope is {fit.slope:.4g} mm per px, which no laser line scanner has; "
+            "write heights in mm, not um"
+        )
     return Calibration(
         heights_mm=tuple(float(value) for value in heights_mm),
         columns_px=tuple(float(value) for value in columns_px),

@@ -88,9 +88,9 @@ class RangeImage:
         """
         place = Path(path)
         try:
+            if place.is_file() and not zipfile.is_zipfile(place):
+                raise ValueError("it is not a .npz file")
             with np.load(place, allow_pickle=False) as stored:
-                if not isinstance(stored, np.lib.npyio.NpzFile):
-                    raise ValueError("it holds a single array")
                 held = {name: stored[name] for name in stored.files}
         except FileNotFoundError:
             raise BadInput(f"there is no range image at {place}; process a stack first") from None
@@ -107,10 +107,10 @@ class RangeImage:
             profile_pitch_um=_pitch(held["profile_pitch_um"], "profile_pitch_um", place),
             intensity=_channel(held, "intensity", height, place),
             width_px=_channel(held, "width_px", height, place),
-            saturated=int(held.get("saturated", 0)),
-            frame_pixels=int(held.get("frame_pixels", 0)),
-            wall_s=float(held.get("wall_s", 0.0)),
-            cpu_s=float(held.get("cpu_s", 0.0)),
+            saturated=int(_count(held, "saturated", place)),
+            frame_pixels=int(_count(held, "frame_pixels", place)),
+            wall_s=_count(held, "wall_s", place),
+            cpu_s=_count(held, "cpu_s", place),
             provenance=_provenance(held, place),
         )
 
@@ -134,8 +134,18 @@ def _channel(held: dict[str, NDArray[Any]], name: str, height: Float32, place: P
     return stored.astype(np.float32, copy=False)
 
 
+def _count(held: dict[str, NDArray[Any]], name: str, place: Path) -> float:
+    stored = held.get(name)
+    if stored is None:
+        return 0.0
+    value = float(stored.item()) if stored.size == 1 and stored.dtype.kind in "fiu" else math.nan
+    if not (math.isfinite(value) and value >= 0):
+        raise BadInput(f"{place}: {name} must be one number, zero or more; process the stack again")
+    return value
+
+
 def _pitch(stored: NDArray[Any], name: str, place: Path) -> float:
-    pitch = float(stored) if stored.size == 1 and stored.dtype.kind in "fiu" else math.nan
+    pitch = float(stored.item()) if stored.size == 1 and stored.dtype.kind in "fiu" else math.nan
     if not (math.isfinite(pitch) and pitch > 0):
         raise BadInput(f"{place}: {name} must be one number of micrometres greater than zero; process the stack again")
     return pitch

@@ -94,6 +94,8 @@ class Description:
 
 def read_description(path: Path) -> Description:
     """Read and check a stack.json. Raises `BadInput` naming the file, the key and what to write instead."""
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise BadInput(f"{path} is not a file but a device or pipe; put the description itself there")
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except FileNotFoundError:

@@ -27,6 +27,10 @@ from scanning.surface.settings import InspectionSettings
 from scanning.surface.uncertainty import budget
 
 #: The roughness patch keeps this distance from damage and from the edge.
+SMALLEST_PITCH_UM, LARGEST_PITCH_UM = 0.01, 10_000.0
+"""Outside these no laser line scans a tool; a pitch in metres or nanometres would ask for filters of any size."""
+LARGEST_HEIGHT_UM = 1e6
+"""A metre: beyond it a height is in another unit, and its squares leave the range of numbers."""
 KEEP_AWAY_UM = 100.0
 #: A damage deeper than this whose floor is flat is remarked on.
 CLIFF_UM = 300.0
@@ -71,8 +75,19 @@ def _check(image: RangeImage, name: str) -> None:
         pitch = getattr(image, pitch_name)
         if not (math.isfinite(pitch) and pitch > 0):
             raise BadInput(f"The {name} has {pitch_name} {pitch}; without a positive pitch nothing has a size.")
+        if not SMALLEST_PITCH_UM <= pitch <= LARGEST_PITCH_UM:
+            raise BadInput(
+                f"The {name} has {pitch_name} {pitch:g}, but a pitch lies between {SMALLEST_PITCH_UM:g} and "
+                f"{LARGEST_PITCH_UM:g} um; check its unit."
+            )
     if not np.isfinite(image.height_um).any():
         raise BadInput(f"No pixel of the {name} was measured; check that the laser line lay on the tool.")
+    with np.errstate(invalid="ignore"):
+        tallest = float(np.nanmax(np.abs(image.height_um)))
+    if tallest > LARGEST_HEIGHT_UM:
+        raise BadInput(
+            f"The {name} holds a height of {tallest:.3g} um, more than {LARGEST_HEIGHT_UM:g}; check its unit."
+        )
 
 
 def _turn(image: RangeImage) -> RangeImage:

@@ -16,6 +16,7 @@ GOOD = "height_mm,column_px\n0.14,9.152\n0.25,17.9658\n0.36,25.72\n0.44,29.8984\
     ("text", "said"),
     [
         ("", "is empty"),
+        ("height_mm,column_px\n140,9.152\n250,17.9658\n360,25.72\n", "write heights in mm, not um"),
         ("\n \n", "is empty"),
         ("height,column_px\n1,2\n2,3\n3,4\n", "has no column height_mm"),
         ("height_mm,pixel\n1,2\n2,3\n3,4\n", "has no column column_px"),

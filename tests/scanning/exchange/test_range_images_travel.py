@@ -79,6 +79,9 @@ GOOD = {"height_um": np.zeros((3, 4), np.float32), "row_pitch_um": 7.0, "profile
         ({"height_um": np.array([["a"]])}, "height_um is <U1"),
         ({"height_um": np.array([[None]])}, "is not a range image or is damaged"),
         ({"intensity": np.zeros((4, 3))}, "intensity is float64 of shape (4, 3), but height_um is (3, 4)"),
+        ({"saturated": "x"}, "saturated must be one number"),
+        ({"frame_pixels": np.zeros(3)}, "frame_pixels must be one number"),
+        ({"wall_s": np.nan}, "wall_s must be one number"),
         ({"provenance": "{"}, "provenance is not JSON"),
         ({"provenance": "[]"}, "provenance is not a JSON object"),
     ],
@@ -100,6 +103,13 @@ def test_what_is_no_range_file_is_refused(tmp_path: Path, data: bytes) -> None:
     (tmp_path / "r.x3p").write_bytes(data)
     with pytest.raises(BadInput, match=r"r\.x3p is not a readable X3P"):
         read_range(tmp_path / "r.x3p")
+
+
+def test_a_single_array_under_the_name_of_a_range_image_is_refused(tmp_path: Path) -> None:
+    with (tmp_path / "r.npz").open("wb") as file:
+        np.save(file, np.zeros((3, 4)))
+    with pytest.raises(BadInput, match=r"r\.npz is not a range image"):
+        read_range(tmp_path / "r.npz")
 
 
 @pytest.mark.parametrize("name", ["r.npz", "r.x3p", "."])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -324,3 +325,9 @@ def test_a_changed_pixel_in_the_store_is_noticed_when_read(tmp_path: Path) -> No
         stack.step(1)
         with pytest.raises(BadInput, match="damaged at step 2: a frame fails its checksum"):
             stack.step(2)
+
+
+def test_a_pipe_in_the_place_of_the_description_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "stack.json")
+    with pytest.raises(BadInput, match="device or pipe"):
+        open_stack(tmp_path)
