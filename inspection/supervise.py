@@ -114,7 +114,7 @@ class Supervisor:
                 child.wait_s = 1.0 if lived > SETTLED_S else min(child.wait_s * 2, LONGEST_WAIT_S)
                 child.not_before = now + child.wait_s
                 self._say(
-                    f"{child.name} stopped (exit {child.process.returncode}); starting it again in {child.wait_s:.0f} s. "
+                    f"{child.name} stopped (exit {child.process.returncode}); starting again in {child.wait_s:.0f} s. "
                     f"Its log: {child.log}"
                 )
                 with contextlib.suppress(ProcessLookupError, PermissionError):

@@ -27,5 +27,5 @@ class CameraFault(RigFault):
     """The camera sent nothing, an incomplete frame, or a frame of the wrong size."""
 
 
-class Stopped(Exception):  # noqa: N818 - not an error: a person asked for it
+class Stopped(Exception):
     """A person asked the running scan to stop; the rig is parked and the laser is off."""

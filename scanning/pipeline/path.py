@@ -10,12 +10,14 @@ Speckle scatters the width of a single row from half to twice the line's, so wid
 rows each way) along neighbours within a line width: a reflection is too wide in all its rows, the line only by chance.
 A reflection that touches the line widens it on one side only, so twice the narrower half may pass as the width too.
 Between one candidate and the next of the path, d line widths to the side cost min(STIFF d, jump + FAR d): a bend costs
-what it bends; a step of the surface, a damage or a reflection costs a jump; further than gate_max_px nothing
-goes, because where the line has ended a reflection far away is no line. Rows in between cost nothing, whether damage,
-darkness or reflection fills them.
+what it bends; a step of the surface, a damage or a reflection costs a jump, the more the further it goes. A step has
+its other side in the next rows, however high it is (a gauge block is lost whole where steps are limited); further than
+gate_max_px, or than a tilted line would get, nothing goes across a longer gap, because where the line has ended a
+reflection far away is no line. Rows in between cost nothing, whether damage, darkness or reflection fills them.
 
-A path is forgotten as soon as a path of a later row is so much better that coming over from that one to where it stands
-costs less than it is behind: the cost is concave in d, so it could not win again. A handful of paths stay alive.
+A path is forgotten as soon as a path of a later row within gate_max_px is so much better that coming over from that one
+to where it stands costs less than it is behind: the cost is concave in d, so it could not win again. A handful of paths
+stay alive.
 """
 
 from __future__ import annotations
@@ -30,7 +32,12 @@ ROWS_BACK = 3
 """A candidate's neighbour may be missing in up to two rows."""
 STIFF = 1.0
 """Reward lost per line width moved to the side."""
-FAR = 0.1
+FAR = 0.3
+"""The same beyond a jump: of two steps the lower one is likelier."""
+TILT = 0.6
+"""Across a gap a line may go on this steeply, px a row."""
+LEAP_ROWS = 16
+"""Rows within which the other side of a high step must be seen."""
 BY_LIGHT = 0.1
 """This share of the reward depends on the light: of two equal paths the brighter one is the line."""
 BRIGHT = 0.25
@@ -97,9 +104,9 @@ def mean_of_highest(counts, height):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def cost(moved, width, jump, furthest):  # type: ignore[no-untyped-def]
-    """What it costs to go ``moved`` px to the side."""
-    if moved > furthest + TIE:
+def cost(moved, rows_on, width, jump, gate):  # type: ignore[no-untyped-def]
+    """What it costs to go ``moved`` px to the side, ``rows_on`` rows further."""
+    if moved > max(gate, TILT * rows_on) + TIE and rows_on > LEAP_ROWS:
         return np.inf
     widths = moved / width
     return min(STIFF * widths, jump + FAR * widths)
@@ -107,7 +114,7 @@ def cost(moved, width, jump, furthest):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def find_path(  # type: ignore[no-untyped-def]
-    counts, shape, half, height, widened, expected, factor, width, jump, furthest, average, score, back_row, back_peak,
+    counts, shape, half, height, widened, expected, factor, width, jump, gate, average, score, back_row, back_peak,
     alive, chosen,
 ):  # fmt: skip
     """Choose the candidate of every row that is on the best path, -1 where there is none.
@@ -129,13 +136,14 @@ def find_path(  # type: ignore[no-untyped-def]
             earned = 1.0
             if judged:
                 earned = likeness(average[r, k], widened, expected, factor)
-            if earned <= 0.0:
+            if earned <= TIE:
                 continue
             earned *= 1.0 - BY_LIGHT + BY_LIGHT * min(1.0, height[r, k] / bright)
             value, from_row, from_peak = earned, -1, -1
             for s in range(living - 1, -1, -1):  # the latest first: it wins a tie
                 q, p = alive[s, 0], alive[s, 1]
-                through = score[q, p] + earned - cost(abs(shape[r, k, 0] - shape[q, p, 0]), width, jump, furthest)
+                moved = abs(shape[r, k, 0] - shape[q, p, 0])
+                through = score[q, p] + earned - cost(moved, r - q, width, jump, gate)
                 if through > value + TIE:
                     value, from_row, from_peak = through, q, p
             score[r, k] = value
@@ -152,8 +160,10 @@ def find_path(  # type: ignore[no-untyped-def]
             keep = True
             if s < living:
                 for n in range(living, fresh):
-                    over = cost(abs(shape[alive[n, 0], alive[n, 1], 0] - shape[q, p, 0]), width, jump, furthest)
-                    if score[alive[n, 0], alive[n, 1]] - over >= score[q, p]:
+                    moved = abs(shape[alive[n, 0], alive[n, 1], 0] - shape[q, p, 0])
+                    if moved > gate + TIE:
+                        continue
+                    if score[alive[n, 0], alive[n, 1]] - cost(moved, 0, width, jump, gate) >= score[q, p]:
                         keep = False
                         break
             if keep:

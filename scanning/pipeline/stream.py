@@ -11,6 +11,7 @@ import platform
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 import numba
@@ -42,6 +43,7 @@ REACH = 2.2
 """Line widths the base reaches to either side at most."""
 PATHS_ALIVE = 1024
 WIDE_PX = 12.0
+VERY_WIDE_PX = 30.0
 """Wider lines than this come from lamp-lit pictures of others: what they must stand out of is structure, not noise."""
 INT32_TOP = (1 << 31) - 1
 Progress = Callable[[int, int], None]
@@ -235,6 +237,7 @@ class ProfileStream:
         if expected is None and width is not None:
             expected = width * broadening(self.recipe.tone.p) if self.recipe.tone is not None else width
         wide = (line.width_px or width or 0.0) > WIDE_PX
+        very_wide = (line.width_px or width or 0.0) > VERY_WIDE_PX
         candidates = line.candidates if line.candidates != "auto" else ("threshold" if wide else "noise")
         floor = line.floor
         if floor is None:
@@ -255,7 +258,7 @@ class ProfileStream:
             if line.grain_px is not None
             else max(GRAIN_PX, (line.width_px or width or 0.0) / 4.0),
             candidates=candidates,
-            continuity=line.continuity if line.continuity != "auto" else ("nearest" if wide else "path"),
+            continuity=line.continuity if line.continuity != "auto" else ("nearest" if very_wide else "path"),
             estimated=tuple(estimated),
         )
         self._chain = _Chain(self.recipe, h, self.settled, selected)
@@ -443,17 +446,22 @@ def profiles_of(stack: Stack, recipe: Recipe) -> Iterator[Profile]:
 
 
 def process_stack(
-    stack: Stack,
+    stack: Stack | str | Path,
     recipe: Recipe | str,
     calibration: HeightScale | None = None,
     progress: Progress | None = None,
 ) -> RangeImage:
     """Turn a stack into a range image.
 
-    Heights come from the calibration, else from the header's mm_per_pixel. ``progress(done, steps)`` is called after
-    every step. A stack too short for one full SCI window raises `BadInput`.
+    ``stack`` may be the path of one. Heights come from the calibration, else from the header's mm_per_pixel.
+    ``progress(done, steps)`` is called after every step. A stack too short for one full SCI window raises `BadInput`.
     """
     recipe = Recipe.named(recipe) if isinstance(recipe, str) else recipe
+    if isinstance(stack, (str, Path)):
+        from scanning.stacks import open_stack
+
+        with open_stack(Path(stack)) as opened:
+            return process_stack(opened, recipe, calibration, progress)
     header = stack.header
     wall, cpu = time.perf_counter(), time.process_time()
     stream = ProfileStream(recipe, header)

@@ -87,9 +87,7 @@ def product(tmp_path: Path) -> Iterator[Product]:
 @pytest.mark.browser
 @pytest.mark.timeout(480)
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium")
-def test_an_operator_scans_a_knife_reads_its_verdict_and_takes_the_report_away(
-    product: Product, tmp_path: Path
-) -> None:
+def test_an_operator_scans_a_knife_and_takes_the_report_away(product: Product, tmp_path: Path) -> None:
     password = product.wait_for(r"\bolga\s+operator\s+(\S+)", START_S).group(1)
     address = product.wait_for(r"Edgewatch is up: (http://\S+?)/ ", START_S).group(1)
 
@@ -107,7 +105,9 @@ def test_an_operator_scans_a_knife_reads_its_verdict_and_takes_the_report_away(
         taken.value.save_as(report)
         assert report.read_bytes().startswith(b"%PDF")
 
-        page.locator("section.region", has=page.get_by_role("heading", name="R3")).get_by_text("See the surface").click()
+        page.locator("section.region", has=page.get_by_role("heading", name="R3")).get_by_text(
+            "See the surface"
+        ).click()
         olga.wait_for_surface()
         assert "large" in page.locator("main").inner_text()
         assert olga.complaints == []

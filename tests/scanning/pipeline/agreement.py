@@ -89,7 +89,7 @@ def reference(steps: Steps, header: StackHeader, recipe: Recipe) -> NDArray[np.f
         gate_max=line.gate_max_px,
         seed=line.seed,
         candidates=candidates,
-        continuity=line.continuity if line.continuity != "auto" else ("nearest" if light_width > 12 else "path"),
+        continuity=line.continuity if line.continuity != "auto" else ("nearest" if light_width > 30 else "path"),
         jump=line.jump,
         light_width=light_width,
     )

@@ -398,13 +398,22 @@ def best_path(rows: list[list[Peak]], s: Setting) -> list[int]:
                     reward = float(off < TIE)
                 else:
                     reward = max(0.0, min(1.0, 2 * (1 - off / math.log(s.width_factor))))
-            if reward > 0:
+            if reward > TIE:
                 earned[r, k] = reward * (0.9 + 0.1 * min(1.0, peak.height / bright))
+
+    def sideways(a: tuple[int, int], b: tuple[int, int]) -> float:
+        return abs(rows[a[0]][a[1]].middle - rows[b[0]][b[1]].middle)
+
     def price(a: tuple[int, int], b: tuple[int, int]) -> float:
-        moved = abs(rows[a[0]][a[1]].middle - rows[b[0]][b[1]].middle)
-        if moved > s.gate_max + TIE:
+        moved, rows_on = sideways(a, b), abs(b[0] - a[0])
+        if moved > max(s.gate_max, 0.6 * rows_on) + TIE and rows_on > 16:
             return math.inf
-        return min(moved / s.light_width, s.jump + 0.1 * moved / s.light_width)
+        return min(moved / s.light_width, s.jump + 0.3 * moved / s.light_width)
+
+    def stays(old: tuple[int, int], new: tuple[int, int]) -> bool:
+        moved = sideways(old, new)
+        over = min(moved / s.light_width, s.jump + 0.3 * moved / s.light_width)
+        return moved > s.gate_max + TIE or score[new] - over < score[old]
 
     score: dict[tuple[int, int], float] = {}
     before: dict[tuple[int, int], tuple[int, int] | None] = {}
@@ -417,7 +426,8 @@ def best_path(rows: list[list[Peak]], s: Setting) -> list[int]:
                 through = score[other] + earned[key] - price(other, key)
                 if through > score[key] + TIE:
                     score[key], before[key] = through, other
-        alive = [a for a in alive if all(score[key] - price(key, a) < score[a] for key in here)] + here
+        # From beside it, however long ago: the price without a gap.
+        alive = [a for a in alive if all(stays(a, key) for key in here)] + here
     chosen = [-1] * len(rows)
     at: tuple[int, int] | None = None
     for key in sorted(score):
