@@ -25,6 +25,8 @@ DEFAULT_REGIONS = ("R1", "R2", "R3")
 DEFAULT_LENGTH_MM = 245 * 0.00833
 DEFAULT_ROWS = 1000
 DEFAULT_FLAT_ROWS = 600
+#: The cutting edge is at the first rows; the flat part keeps clear of it and of the damage behind it.
+DEFAULT_FLAT_ROW = 350
 
 Row = TypeVar("Row", bound=models.Model)
 
@@ -104,6 +106,7 @@ def _add_default_regions(tool: Tool) -> None:
             start_mm=round(centre_mm - length_mm / 2.0, 3),
             length_mm=length_mm,
             rows=DEFAULT_ROWS,
+            flat_row=DEFAULT_FLAT_ROW,
             flat_rows=DEFAULT_FLAT_ROWS,
         )
 

@@ -36,6 +36,8 @@ FAR = 0.3
 """The same beyond a jump: of two steps the lower one is likelier."""
 TILT = 0.6
 """Across a gap a line may go on this steeply, px a row."""
+LEAP = 30.0
+"""Further reward lost beyond gate_max_px: a gauge block is that many rows long, a stray reflection rarely."""
 LEAP_ROWS = 16
 """Rows within which the other side of a high step must be seen."""
 BY_LIGHT = 0.1
@@ -109,7 +111,8 @@ def cost(moved, rows_on, width, jump, gate):  # type: ignore[no-untyped-def]
     if moved > max(gate, TILT * rows_on) + TIE and rows_on > LEAP_ROWS:
         return np.inf
     widths = moved / width
-    return min(STIFF * widths, jump + FAR * widths)
+    price = min(STIFF * widths, jump + FAR * widths)
+    return price + LEAP if moved > gate + TIE else price
 
 
 @nb.njit(cache=True, nogil=True)

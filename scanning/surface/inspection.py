@@ -82,8 +82,7 @@ def _check(image: RangeImage, name: str) -> None:
             )
     if not np.isfinite(image.height_um).any():
         raise BadInput(f"No pixel of the {name} was measured; check that the laser line lay on the tool.")
-    with np.errstate(invalid="ignore"):
-        tallest = float(np.nanmax(np.abs(image.height_um)))
+    tallest = float(np.abs(image.height_um[np.isfinite(image.height_um)]).max())
     if tallest > LARGEST_HEIGHT_UM:
         raise BadInput(
             f"The {name} holds a height of {tallest:.3g} um, more than {LARGEST_HEIGHT_UM:g}; check its unit."

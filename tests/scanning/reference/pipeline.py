@@ -408,7 +408,8 @@ def best_path(rows: list[list[Peak]], s: Setting) -> list[int]:
         moved, rows_on = sideways(a, b), abs(b[0] - a[0])
         if moved > max(s.gate_max, 0.6 * rows_on) + TIE and rows_on > 16:
             return math.inf
-        return min(moved / s.light_width, s.jump + 0.3 * moved / s.light_width)
+        leap = 30.0 if moved > s.gate_max + TIE else 0.0
+        return min(moved / s.light_width, s.jump + 0.3 * moved / s.light_width) + leap
 
     def stays(old: tuple[int, int], new: tuple[int, int]) -> bool:
         moved = sideways(old, new)
