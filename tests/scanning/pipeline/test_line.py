@@ -165,3 +165,41 @@ def test_uneven_light_along_the_line_is_followed() -> None:
     wrong, lost = wrong_and_lost(light, STRAIGHT)
     assert wrong == 0.0
     assert lost < 0.02
+
+
+def test_a_gauge_block_of_any_height_keeps_its_line() -> None:
+    block = 40.0 + 150.0 * ((ROWS > 120) & (ROWS < 260))
+    wrong, lost = wrong_and_lost(line(block, 256, 3.03, 60.0), block)
+    assert wrong < 0.01
+    assert lost < 0.01
+
+
+def test_a_bright_reflection_far_away_is_not_the_line_where_the_line_is_dark() -> None:
+    dark = (ROWS > 160) & (ROWS < 240)
+    shone_at = (ROWS > 140) & (ROWS < 260)
+    light = line(STRAIGHT, 256, 3.03, 60.0 * ~dark) + line(STRAIGHT + 100.0, 256, 3.2, 150.0 * shone_at)
+    wrong, lost = wrong_and_lost(light, np.where(dark, np.nan, STRAIGHT))
+    assert wrong == 0.0
+    assert lost < 0.02
+
+
+def test_a_tilted_line_goes_on_behind_a_long_dark_stretch() -> None:
+    tilted = 20.0 + 0.5 * ROWS
+    dark = (ROWS > 120) & (ROWS < 264)
+    wrong, lost = wrong_and_lost(line(tilted, 256, 3.03, 60.0 * ~dark), np.where(dark, np.nan, tilted))
+    assert wrong == 0.0
+    assert lost < 0.02
+
+
+def test_a_reflection_as_wide_and_twice_as_bright_beside_the_whole_line_is_left_alone() -> None:
+    light = line(STRAIGHT, 256, 3.03, 60.0) + line(STRAIGHT + 24.0, 256, 3.03, 120.0 * ((ROWS > 60) & (ROWS < 200)))
+    wrong, lost = wrong_and_lost(light, STRAIGHT)
+    assert wrong == 0.0
+    assert lost < 0.02
+
+
+def test_beyond_the_end_of_the_surface_nothing_is_reported() -> None:
+    ended = ROWS < 300
+    wrong, lost = wrong_and_lost(line(STRAIGHT, 256, 3.03, 60.0 * ended), np.where(ended, STRAIGHT, np.nan))
+    assert wrong == 0.0
+    assert lost < 0.01
