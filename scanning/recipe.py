@@ -64,13 +64,17 @@ class Exposure:
     """HDRE, eq. (5), (6): per pixel the longest exposure that is not saturated, divided by its time.
 
     After averaging (HDRE-I) a pixel is saturated when ``all`` of the averaged images are (the literal reading, for the
-    mean is the saturation level only then) or when ``any`` of them is (the physically better one).
+    mean is the saturation level only then) or when ``any`` of them is (the physically better one). A stack must have at
+    least ``fewest`` exposures; with one, its light is taken as it is.
     """
 
     key: ClassVar[str] = "hdre"
     saturated: str = "all"
+    fewest: int = 2
 
     def __post_init__(self) -> None:
+        if not isinstance(self.fewest, int) or not 1 <= self.fewest <= MOST_FRAMES_AVERAGED:
+            raise BadInput(f"Recipe setting hdre.fewest is {_shown(self.fewest)}; it must be a whole number from 1.")
         _choice("hdre.saturated", self.saturated, ("all", "any"))
 
 
@@ -168,8 +172,28 @@ class Centroid:
     key: ClassVar[str] = "cog"
 
 
-Operation = Compound | Exposure | Tone | Line | Centroid
-_OPERATIONS: dict[str, type[Operation]] = {c.key: c for c in (Compound, Exposure, Tone, Line, Centroid)}
+@dataclass(frozen=True)
+class Diagonals:
+    """Space-time analysis on top of COG: ``scanning/pipeline/space_time.py`` says what it does and why.
+
+    ``angle_deg`` of the triangulation (60 on the paper's rig) gives how far the surface moves on the sensor per step;
+    ``px_per_step`` says it outright. ``direction``: to "higher" or "lower" columns; "auto" is seen from the images.
+    """
+
+    key: ClassVar[str] = "sta"
+    angle_deg: float = 60.0
+    px_per_step: float | None = None
+    direction: str = "auto"
+
+    def __post_init__(self) -> None:
+        _number("sta.angle_deg", self.angle_deg, 1.0, 89.0)
+        if self.px_per_step is not None:
+            _number("sta.px_per_step", self.px_per_step, 0.0, 1e4, above=True)
+        _choice("sta.direction", self.direction, ("auto", "higher", "lower"))
+
+
+Operation = Compound | Exposure | Tone | Line | Centroid | Diagonals
+_OPERATIONS: dict[str, type[Operation]] = {c.key: c for c in (Compound, Exposure, Tone, Line, Centroid, Diagonals)}
 
 
 @dataclass(frozen=True)
@@ -187,17 +211,23 @@ class Recipe:
     exposure: str | float = "auto"
     exposures_us: tuple[float, ...] | None = None
 
-    NAMES: ClassVar[tuple[str, ...]] = ("NF", "SCI", "HDRE-I", "HDRE-II", "HDR-CAM")
+    NAMES: ClassVar[tuple[str, ...]] = ("NF", "SCI", "HDRE-I", "HDRE-II", "HDR-CAM", "PRECISE")
 
     def __post_init__(self) -> None:
         keys = [o.key for o in self.operations]
         order = ", ".join(keys)
-        if keys[-2:] != ["msnn", "cog"]:
-            raise BadInput(f"Recipe {self.name} is {order}; it must end with msnn, cog.")
+        if (keys[:-1] if keys[-1:] == ["sta"] else keys)[-2:] != ["msnn", "cog"]:
+            raise BadInput(f"Recipe {self.name} is {order}; it must end with msnn, cog or with msnn, cog, sta.")
         if len(set(keys)) != len(keys):
             raise BadInput(f"Recipe {self.name} is {order}; each operation may appear once.")
         if "hdre" in keys and "glt" in keys and keys.index("glt") < keys.index("hdre"):
             raise BadInput(f"Recipe {self.name} is {order}; glt must come after hdre, which needs linear grey values.")
+        sci = self.compound
+        if "sta" in keys and ("glt" in keys or self.comes_before("sci", "hdre") or sci is None or sci.window % 2 == 0):
+            raise BadInput(
+                f"Recipe {self.name} is {order}; sta follows light through the images of an odd sci window, which must "
+                "not be compressed by glt and must be fused before sci."
+            )
         if self.response == "logarithmic" and ("hdre" in keys or "glt" in keys):
             raise BadInput(f"Recipe {self.name} is {order}; a logarithmic camera needs neither hdre nor glt.")
         if self.exposure != "auto":
@@ -228,6 +258,11 @@ class Recipe:
         return found if isinstance(found, Tone) else None
 
     @property
+    def diagonals(self) -> Diagonals | None:
+        found = self.find("sta")
+        return found if isinstance(found, Diagonals) else None
+
+    @property
     def line(self) -> Line:
         found = self.find("msnn")
         assert isinstance(found, Line)
@@ -253,7 +288,7 @@ class Recipe:
 
     @classmethod
     def named(cls, name: str) -> Recipe:
-        """One of the five methods of the paper."""
+        """One of the five methods of the paper, or our own PRECISE."""
         make = _NAMED.get(name.upper() if isinstance(name, str) else "")
         if make is None:
             raise BadInput(f"There is no recipe {_shown(name)}; the recipes are {', '.join(cls.NAMES)}.")
@@ -351,7 +386,7 @@ class Recipe:
         """Raise `BadInput` when this recipe cannot read such a stack."""
         camera = header.response
         if self.response != "any" and self.response != camera:
-            instead = "HDR-CAM, SCI or NF" if camera == "logarithmic" else "NF, SCI, HDRE-I or HDRE-II"
+            instead = "HDR-CAM, SCI or NF" if camera == "logarithmic" else "PRECISE, NF, SCI, HDRE-I or HDRE-II"
             raise BadInput(
                 f"Recipe {self.name} is for a {self.response} camera but the stack is {camera}; use {instead}."
             )
@@ -363,12 +398,12 @@ class Recipe:
                     f"Recipe {self.name} wants the exposure {missing[0]:g} us but the stack has "
                     f"{', '.join(f'{t:g}' for t in header.exposures_us)} us; choose among these."
                 )
-            if len(used) < 2:
+            if len(used) < self.hdre.fewest:
                 raise BadInput(
                     f"Recipe {self.name} fuses several exposures but the stack has only {used[0]:g} us; "
                     "use NF or SCI, or record a bracket."
                 )
-            if min(used) <= 0:
+            if len(used) > 1 and min(used) <= 0:
                 raise BadInput(f"Recipe {self.name} divides by the exposure time, but one is {min(used):g} us.")
         elif self.exposure != "auto" and self.exposure not in header.exposures_us:
             raise BadInput(
@@ -414,7 +449,8 @@ _READERS: dict[str, Callable[[str, str], Any]] = {
     "snr": _read_float_or_default, "grain_px": _read_float_or_default,
     "width_px": _read_float_or_default, "width_factor": _read_float, "gate_px": _read_float,
     "gate_max_px": _read_float, "seed": _read_text, "candidates": _read_text, "continuity": _read_text,
-    "jump": _read_float,
+    "jump": _read_float, "fewest": _read_int, "angle_deg": _read_float, "px_per_step": _read_float_or_default,
+    "direction": _read_text,
 }  # fmt: skip
 
 
@@ -428,4 +464,7 @@ _NAMED: dict[str, Callable[[], Recipe]] = {
     "HDRE-I": _recipe("HDRE-I", Compound(), Exposure(), Tone(), response="linear"),
     "HDRE-II": _recipe("HDRE-II", Exposure(), Tone(), Compound(), response="linear"),
     "HDR-CAM": _recipe("HDR-CAM", Compound(), response="logarithmic"),
+    "PRECISE": lambda: Recipe(
+        "PRECISE", (Exposure(fewest=1), Compound("sliding"), Line(), Centroid(), Diagonals()), response="linear"
+    ),
 }

@@ -50,10 +50,10 @@ def warm_up(progress: Callable[[int, int], None] | None = None) -> None:
     jobs = [
         (name, kind, bits)
         for bits, kind in ((8, np.uint8), (16, np.uint16))
-        for name in ("NF", "SCI", "HDRE-I", "HDRE-II")
+        for name in ("NF", "SCI", "HDRE-I", "HDRE-II", "PRECISE")
     ]
     for done, (name, kind, bits) in enumerate(jobs, start=1):
-        times = (1.0, 2.0) if name.startswith("HDRE") else (1.0,)
+        times = (1.0, 2.0) if name[:4] in ("HDRE", "PREC") else (1.0,)
         header = StackHeader(
             rows=16, columns=64, steps=5, exposures_us=times, step_um=1.0, row_pitch_um=1.0, mm_per_pixel=1.0,
             saturation=(1 << bits) - 1, bits=bits,

@@ -10,7 +10,7 @@ import math
 import platform
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -25,6 +25,7 @@ from scanning.pipeline.compound import CompoundWindow
 from scanning.pipeline.exposure import exposure_grey, fuse_codes, fuse_sums, look_up
 from scanning.pipeline.grey import DARK_UNIT
 from scanning.pipeline.line import extract_line
+from scanning.pipeline.space_time import SpaceTime, px_per_step
 from scanning.pipeline.standing_out import PLACES, box_for
 from scanning.pipeline.tone import GREY_TOP, broadening, fixed_point, grey_bits, light_share, scaled_codes, tone
 from scanning.range_image import RangeImage
@@ -42,6 +43,8 @@ GRAIN_PX = 3.0
 REACH = 2.2
 """Line widths the base reaches to either side at most."""
 PATHS_ALIVE = 1024
+LEAST_SPEED, MOST_SPEED = 0.18, 0.6
+"""Space-time analysis needs a surface that moves by these shares of the line's width per step, or between."""
 WIDE_PX = 12.0
 VERY_WIDE_PX = 30.0
 """Wider lines than this come from lamp-lit pictures of others: what they must stand out of is structure, not noise."""
@@ -117,6 +120,7 @@ class ProfileStream:
         self._saturated = 0
         self._pixels = 0
         self._chain: _Chain | None = None
+        self._space_time: SpaceTime | None = None
         if not self._unknowns():
             self._settle([])
 
@@ -131,8 +135,11 @@ class ProfileStream:
         return self._release() if len(self._waiting) >= FIRST_STEPS else []
 
     def finish(self) -> list[Profile]:
-        """The profiles still held back because the first steps were too few to estimate from."""
-        return self._release() if self._waiting else []
+        """The profiles still held back: first steps too few to estimate from, or waiting for images to come."""
+        out = self._release() if self._waiting else []
+        if self._space_time is not None:
+            out += [replace(profile, column_px=column) for column, profile in self._space_time.ready(end=True)]
+        return out
 
     def _release(self) -> list[Profile]:
         waiting, self._waiting = self._waiting, []
@@ -168,21 +175,29 @@ class ProfileStream:
         step = self._steps
         self._steps += 1
         lines = self._chain.run(used)
-        if lines is None:
-            return []
-        sci = self.recipe.compound
-        profile = Profile(
-            index=self._profiles,
-            position_um=(step - 0.5 * ((sci.window if sci else 1) - 1)) * self.header.step_um,
-            column_px=lines[0],
-            intensity=lines[1],
-            width_px=lines[2],
-            saturated=self._saturated,
-            frame_pixels=self._pixels,
-        )
-        self._profiles += 1
-        self._saturated = self._pixels = 0
-        return [profile]
+        out: list[Profile] = []
+        if lines is not None:
+            sci = self.recipe.compound
+            profile = Profile(
+                index=self._profiles,
+                position_um=(step - 0.5 * ((sci.window if sci else 1) - 1)) * self.header.step_um,
+                column_px=lines[0],
+                intensity=lines[1],
+                width_px=lines[2],
+                saturated=self._saturated,
+                frame_pixels=self._pixels,
+            )
+            self._profiles += 1
+            self._saturated = self._pixels = 0
+            out.append(profile)
+        return out if self._space_time is None else self._later(self._space_time, out)
+
+    def _later(self, space_time: SpaceTime, profiles: list[Profile]) -> list[Profile]:
+        assert self._chain is not None
+        space_time.add(self._chain.single)
+        for profile in profiles:
+            space_time.wait(profile.column_px, *self._chain.bases(), profile)
+        return [replace(profile, column_px=column) for column, profile in space_time.ready()]
 
     def candidates(self) -> tuple[Float64, Float64]:
         """The peaks of the last profile as (row, column px) pairs: those taken as the line, and those rejected.
@@ -262,6 +277,15 @@ class ProfileStream:
             estimated=tuple(estimated),
         )
         self._chain = _Chain(self.recipe, h, self.settled, selected)
+        sta, sci = self.recipe.diagonals, self.recipe.compound
+        if sta is not None and sci is not None:
+            speed = sta.px_per_step or px_per_step(h.step_um, h.mm_per_pixel, sta.angle_deg)
+            light_width = line.width_px or width or GRAIN_PX
+            if LEAST_SPEED * light_width <= speed <= MOST_SPEED * light_width:
+                direction = {"auto": 0, "higher": 1, "lower": -1}[sta.direction]
+                self._space_time = SpaceTime(
+                    h.rows, h.columns, sci.window, speed, direction, REACH * light_width, *self._chain.single_grey
+                )
 
     def provenance(self) -> dict[str, Any]:
         """JSON-serialisable: recipe, header, what was estimated and used, software."""
@@ -271,6 +295,8 @@ class ProfileStream:
         notes: list[str] = []
         if settled is not None and settled.expected_width_px is None:
             notes.append("The line's width is unknown and too few rows show a line; peaks of any width were taken.")
+        if self.recipe.diagonals is not None and self._space_time is None:
+            notes.append("The surface moves too far or too little per step for space-time analysis; it was left out.")
         return {
             "recipe": self.recipe.to_json(),
             "recipe_sha256": self.recipe.sha256(),
@@ -285,6 +311,7 @@ class ProfileStream:
             "grain_px": None if settled is None else settled.grain_px,
             "candidates": None if settled is None else settled.candidates,
             "continuity": None if settled is None else settled.continuity,
+            "space_time_direction": None if self._space_time is None else self._space_time.direction,
             "estimated": [] if settled is None else list(settled.estimated),
             "notes": notes,
             "versions": {
@@ -376,6 +403,7 @@ class _Chain:
     def run(self, images: list[Image]) -> tuple[Float64, Float32, Float32] | None:
         """(column_px, intensity, width_px) once enough images are in, else None."""
         image: NDArray[Any] = images[0]
+        self._last = images[0]
         if self._table_first:
             self._apply_tables(images)
             image = self._fused
@@ -401,6 +429,25 @@ class _Chain:
             image, self._top, self._scale, self._dark, *self._line, highest, *self._scratch, column_px, peak, width_px
         )
         return column_px, (peak / self._grey_level).astype(np.float32), width_px.astype(np.float32)
+
+    @property
+    def single(self) -> NDArray[Any]:
+        """The image of the last stage position before SCI; only lent."""
+        return self._fused if self._table_first else self._last
+
+    @property
+    def single_grey(self) -> tuple[int, int, int]:
+        """(top, scale, dark) of `single`; see `grey.grey`."""
+        if self._table_first:
+            return INT32_TOP, 1, 0
+        return self._saturation, DARK_UNIT, self._dark // self._window
+
+    def bases(self) -> tuple[NDArray[np.int64], Float64]:
+        """Of the last profile's line: first and last column (rows, 2), and the pedestal in light of one image."""
+        base, chosen, pedestal = self._scratch[1], self._scratch[5], self._scratch[10]
+        rows, at = np.arange(self._rows), np.maximum(chosen, 0)
+        level = pedestal[rows, at] / self._window if self._line[0] else np.zeros(self._rows)
+        return base[rows, at], level
 
     def candidates(self) -> tuple[Float64, Float64]:
         shape, counts, chosen = self._scratch[2], self._scratch[4], self._scratch[5]

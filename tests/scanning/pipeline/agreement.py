@@ -91,9 +91,20 @@ def reference(steps: Steps, header: StackHeader, recipe: Recipe) -> NDArray[np.f
         candidates=candidates,
         continuity=line.continuity if line.continuity != "auto" else ("nearest" if light_width > 30 else "path"),
         jump=line.jump,
+        speed=speed_of(recipe, header, light_width),
+        direction={"auto": 0, "higher": 1, "lower": -1}[recipe.diagonals.direction] if recipe.diagonals else 0,
         light_width=light_width,
     )
     return range_columns(steps, setting)
+
+
+def speed_of(recipe: Recipe, header: StackHeader, light_width: float) -> float | None:
+    """How far the surface moves on the sensor per step, where space-time analysis can use it."""
+    if recipe.diagonals is None:
+        return None
+    lateral_um = header.mm_per_pixel * 1000.0 / math.tan(math.radians(recipe.diagonals.angle_deg))
+    speed = recipe.diagonals.px_per_step or header.step_um / lateral_um
+    return speed if 0.18 * light_width <= speed <= 0.6 * light_width else None
 
 
 def assert_agree(steps: Steps, header: StackHeader, recipe: Recipe) -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from scanning.recipe import Centroid, Compound, Exposure, Line, Operation, Recipe, Tone
+from scanning.recipe import Centroid, Compound, Diagonals, Exposure, Line, Operation, Recipe, Tone
 from tests.scanning.pipeline.agreement import Steps, assert_agree, header_for
 from tests.scanning.pipeline.scenes import line, shot, speckle
 
@@ -66,8 +66,14 @@ def anything(draw: st.DrawFn) -> tuple[Steps, tuple[float, ...], int, float, flo
         continuity=draw(st.sampled_from(["auto", "nearest", "path"])),
         jump=draw(st.sampled_from([0.0, 2.0, 10.0])),
     )
-    recipe = Recipe("any", (*before, msnn, Centroid()))
-    steps = draw(st.integers(sci.window if recipe.compound else 1, 10))
+    after: tuple[Operation, ...] = (Centroid(),)
+    most = 10
+    if before in [(sci,), (hdre, sci)] and sci.window % 2 and draw(st.booleans()):
+        way = draw(st.sampled_from(["auto", "higher", "lower"]))
+        after = (Centroid(), Diagonals(px_per_step=draw(st.sampled_from([None, 0.7, 1.8])), direction=way))
+        most = 24
+    recipe = Recipe("any", (*before, msnn, *after))
+    steps = draw(st.integers(sci.window if recipe.compound else 1, most))
     used = times if recipe.hdre else (100.0,)
     dtype = np.uint8 if bits == 8 else np.uint16
     stack: Steps = []
@@ -87,16 +93,16 @@ def test_any_recipe_on_any_frames(case: tuple[Steps, tuple[float, ...], int, flo
 
 @pytest.mark.parametrize("letter", [False, True], ids=["as shipped", "to the letter"])
 @pytest.mark.parametrize("name", Recipe.NAMES)
-def test_the_five_methods_on_speckle_with_a_ghost_and_a_break(name: str, letter: bool) -> None:
+def test_every_recipe_on_speckle_with_a_ghost_and_a_break(name: str, letter: bool) -> None:
     rng = np.random.default_rng(7)
     rows, columns = 150, 200
     centre = 90.0 + 0.1 * np.arange(rows) + 30.0 * (np.arange(rows) > 100)
     lit = line(centre, columns, 3.03, 60.0) * ((np.arange(rows) < 60) | (np.arange(rows) > 75))[:, None]
     lit += line(np.full(rows, 30.0), columns, 9.0, 150.0 * (np.arange(rows) % 50 < 20))
     logarithmic = name == "HDR-CAM"
-    times = BRACKET if name.startswith("HDRE") else (100.0,)
+    times = BRACKET if name.startswith("HDRE") or name == "PRECISE" else (100.0,)
     steps: Steps = []
-    for _ in range(10):
+    for _ in range(22 if name == "PRECISE" else 10):
         scene = speckle(lit, rng)
         if logarithmic:
             scene = 40.0 * np.log10(1.0 + 100.0 * scene)
@@ -106,7 +112,7 @@ def test_the_five_methods_on_speckle_with_a_ghost_and_a_break(name: str, letter:
     if logarithmic:
         recipe = recipe.with_settings({"msnn.width_px": "8"})
     got = assert_agree(steps, header, recipe.with_settings(LETTER) if letter else recipe)
-    assert got.shape == (rows, 10 if name == "NF" else 2)
+    assert got.shape == (rows, {"NF": 10, "PRECISE": 18}.get(name, 2))
     assert np.isfinite(got).mean() > 0.5
 
 

@@ -7,7 +7,7 @@ A stack here is a list of steps, a step a list of images (shortest exposure firs
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -45,6 +45,8 @@ class Setting:
     candidates: str = "noise"
     continuity: str = "path"
     jump: float = 10.0
+    speed: float | None = None  # px per step of the surface on the sensor, for space-time analysis
+    direction: int = 0
     light_width: float = 3.0  # px, before GLT; 3 where nobody knows
 
 
@@ -440,20 +442,55 @@ def best_path(rows: list[list[Peak]], s: Setting) -> list[int]:
     return chosen
 
 
-def profile(image: Array, s: Setting) -> Array:
-    """MSNN and eq. (8) on one image whose black level is off; NaN where there is no line."""
+@dataclass
+class Line:
+    """The chosen candidate of a row and its centre of gravity."""
+
+    column: float
+    peak: Peak
+
+
+def lines(image: Array, s: Setting) -> list[Line | None]:
+    """MSNN and eq. (8) on one image whose black level is off; None where there is no line."""
     faint = s.snr * noise_of(image) * STRICT
     image = np.maximum(image, 0.0)
     rows = standing_out(image, faint, s) if s.candidates == "noise" else above_threshold(image, faint, s)
-    out = np.full(len(rows), np.nan)
+    out: list[Line | None] = []
     for r, k in enumerate(best_path(rows, s) if s.continuity == "path" else the_line(rows, s)):
+        out.append(None)
         if k >= 0:
+            peak = rows[r][k]
             mask = np.zeros(image.shape[1])
-            mask[rows[r][k].first : rows[r][k].last + 1] = 1
+            mask[peak.first : peak.last + 1] = 1
             columns = np.arange(image.shape[1])
-            weight = np.maximum(image[r] - rows[r][k].pedestal, 0.0) * mask
+            weight = np.maximum(image[r] - peak.pedestal, 0.0) * mask
             if weight.sum() > 0:
-                out[r] = (columns * weight).sum() / weight.sum()
+                out[r] = Line((columns * weight).sum() / weight.sum(), peak)
+    return out
+
+
+def column_of(found: list[Line | None]) -> Array:
+    return np.array([math.nan if line is None else line.column for line in found])
+
+
+def along_the_diagonals(
+    singles: list[Array], centre: int, steps: int, speed: float, found: list[Line | None], s: Setting
+) -> Array:
+    """Centre of gravity in time of the light of surface points that move ``speed`` px per image."""
+    out = column_of(found)
+    for r, line in enumerate(found):
+        if line is None:
+            continue
+        light, when = [], []
+        for j in range(-(s.window // 2), s.window // 2 + 1):
+            for k in range(-steps, steps + 1):
+                P = np.maximum(singles[centre + j + k][r], 0.0)  # noqa: N806
+                x = line.column + speed * k
+                if max(0, line.peak.first - 1) <= x <= min(P.size - 1, line.peak.last + 1):
+                    light.append(max(0.0, float(np.interp(x, np.arange(P.size), P)) - line.peak.pedestal))
+                    when.append(k)
+        if sum(light) > 0:
+            out[r] += speed * np.average(when, weights=light)
     return out
 
 
@@ -471,4 +508,22 @@ def above_threshold(image: Array, faint: float, s: Setting) -> list[list[Peak]]:
 
 def range_columns(stack: list[list[NDArray[Any]]], s: Setting) -> Array:
     """(rows, profiles) columns of the line, px from 0."""
-    return np.stack([profile(image, s) for image in grey_images(stack, s)], axis=1)
+    found = [lines(image, s) for image in grey_images(stack, s)]
+    columns = [column_of(one) for one in found]
+    if s.speed is not None:
+        singles = grey_images(stack, replace(s, order=tuple(o for o in s.order if o != "sci")))
+        steps = min(12, math.ceil(2.2 * s.light_width / s.speed))
+        need = s.window // 2 + steps
+        way = s.direction
+        for n, span in enumerate(windows(len(stack), s)):
+            centre = span[len(span) // 2]
+            if not need <= centre < len(stack) - need:
+                continue
+            ways = {w: along_the_diagonals(singles, centre, steps, w * s.speed, found[n], s) for w in (-1, 1)}
+            if way == 0:
+                rough = {w: np.abs(np.diff(c)) for w, c in ways.items()}
+                if not np.isfinite(rough[1]).any():
+                    continue
+                way = -1 if np.nanmedian(rough[-1]) <= np.nanmedian(rough[1]) else 1
+            columns[n] = ways[way]
+    return np.stack(columns, axis=1)
