@@ -37,7 +37,7 @@ import numpy as np
 from scanning.pipeline.centroid import centre_above, centre_of_gravity
 from scanning.pipeline.grey import grey
 from scanning.pipeline.path import find_path
-from scanning.pipeline.standing_out import BOX_WIDENS, level_and_spread, row_candidates, smooth_row
+from scanning.pipeline.standing_out import BOX_WIDENS, level_and_spread, light_of_row, row_candidates, smooth_row
 
 BLOCK = 64
 """Columns looked at together: a block without a pixel above the threshold is skipped whole."""
@@ -336,13 +336,19 @@ def candidates_by_threshold(  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def candidates_by_noise(  # type: ignore[no-untyped-def]
-    image, top, scale, dark, floor, from_row_mean, snr, faint, grain_px, reach, box, three, once, smooth, seen, maxima,
+    image, top, scale, dark, floor, from_row_mean, snr, faint, grain_px, reach, box, rows_of, seen, maxima,
     base, shape, half, height, pedestal, counts,
 ):  # fmt: skip
     """What stands out of the noise in every row; see standing_out.py."""
     level, spread = level_and_spread(image, box, top, scale, dark, seen)
-    for r in range(image.shape[0]):
-        smooth_row(image, r, box, top, scale, dark, three, once, smooth)
+    rows = image.shape[0]
+    three, once, smooth = rows_of[3], rows_of[4], rows_of[5]
+    light_of_row(image, 0, top, scale, dark, rows_of[0])
+    for r in range(rows):
+        if r + 1 < rows:
+            light_of_row(image, r + 1, top, scale, dark, rows_of[(r + 1) % 3])
+        above, below = max(r - 1, 0) % 3, min(r + 1, rows - 1) % 3
+        smooth_row(rows_of[above], rows_of[r % 3], rows_of[below], box, three, once, smooth)
         counts[r] = row_candidates(
             image[r], smooth, level, spread, snr, faint, floor, from_row_mean, grain_px, reach, box, top, scale, dark,
             maxima, base[r], shape[r], half[r], height[r], pedestal[r],
@@ -366,8 +372,8 @@ def extract_line(  # type: ignore[no-untyped-def]
     faint = snr * noise_of(image, top, scale) * STRICT if snr > 0.0 else 0.0
     if by_noise:
         candidates_by_noise(
-            image, top, scale, dark, floor, from_row_mean, snr, faint, grain_px, reach, box, rows_of[0], rows_of[1],
-            rows_of[2], seen, maxima, base, shape, half, height, pedestal, counts,
+            image, top, scale, dark, floor, from_row_mean, snr, faint, grain_px, reach, box, rows_of, seen, maxima,
+            base, shape, half, height, pedestal, counts,
         )  # fmt: skip
     else:
         candidates_by_threshold(
