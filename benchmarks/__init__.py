@@ -1,0 +1,1 @@
+"""Figures anyone can print again: scene, method, figure, ratio, as Markdown on stdout."""
