@@ -359,8 +359,8 @@ def candidates_by_noise(  # type: ignore[no-untyped-def]
 def extract_line(  # type: ignore[no-untyped-def]
     image, top, scale, dark, by_noise, by_path, k, floor, from_row_mean, ceiling, snr, grain_px, expected, factor,
     gate_px, gate_max_px, best_seed, light_width, jump, reach, box,
-    highest, light, base, shape, height, counts, chosen, rows_of, seen, maxima, half, pedestal, average, score, back,
-    alive,
+    highest, light, base, shape, height, counts, chosen, rows_of, seen, maxima, half, pedestal, average, track, score,
+    back, alive,
     column_px, peak, width_px,
 ):  # fmt: skip
     """MSNN then COG on one (rows, columns) image of integer codes (see `grey.grey` for top, scale, dark).
@@ -388,8 +388,8 @@ def extract_line(  # type: ignore[no-untyped-def]
                 for p in range(counts[r]):
                     half[r, p, :] = 0.5 * shape[r, p, 1]
         find_path(
-            counts, shape, half, height, widened, expected, factor, light_width, jump, gate_max_px, average, score,
-            back[0], back[1], alive, chosen,
+            counts, shape, half, height, widened, expected, factor, light_width, jump, gate_max_px, average, track,
+            score, back[0], back[1], alive, chosen,
         )  # fmt: skip
     else:
         find_line(counts, shape, height, expected, factor, gate_px, gate_max_px, best_seed, chosen)

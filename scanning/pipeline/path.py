@@ -10,10 +10,11 @@ Speckle scatters the width of a single row from half to twice the line's, so wid
 rows each way) along neighbours within a line width: a reflection is too wide in all its rows, the line only by chance.
 A reflection that touches the line widens it on one side only, so twice the narrower half may pass as the width too.
 Between one candidate and the next of the path, d line widths to the side cost min(STIFF d, jump + FAR d): a bend costs
-what it bends; a step of the surface, a damage or a reflection costs a jump, the more the further it goes. A step has
-its other side in the next rows, however high it is (a gauge block is lost whole where steps are limited); further than
-gate_max_px, or than a tilted line would get, nothing goes across a longer gap, because where the line has ended a
-reflection far away is no line. Rows in between cost nothing, whether damage, darkness or reflection fills them.
+what it bends; a step of the surface, a damage or a reflection costs a jump, the more the further it goes. Rows in
+between cost nothing, whether damage, darkness or reflection fills them.
+Further than gate_max_px (or than a tilted line would get over the gap) only a step leads: a block's line starts where
+the other one ends, within a few rows, however high the block is; a reflection has rows in common with the line. Where
+the line has ended, a reflection far away is no line.
 
 A path is forgotten as soon as a path of a later row within gate_max_px is so much better that coming over from that one
 to where it stands costs less than it is behind: the cost is concave in d, so it could not win again. A handful of paths
@@ -36,10 +37,10 @@ FAR = 0.3
 """The same beyond a jump: of two steps the lower one is likelier."""
 TILT = 0.6
 """Across a gap a line may go on this steeply, px a row."""
-LEAP = 30.0
-"""Further reward lost beyond gate_max_px: a gauge block is that many rows long, a stray reflection rarely."""
 LEAP_ROWS = 16
 """Rows within which the other side of a high step must be seen."""
+IN_COMMON = 2
+"""Rows the two sides of a step may both be seen in: the lens blurs its brink."""
 BY_LIGHT = 0.1
 """This share of the reward depends on the light: of two equal paths the brighter one is the line."""
 BRIGHT = 0.25
@@ -47,8 +48,11 @@ BRIGHT = 0.25
 
 
 @nb.njit(cache=True, nogil=True)
-def average_halves(counts, shape, half, near, average):  # type: ignore[no-untyped-def]
-    """Write average (rows, peaks, side, direction): half widths averaged over the rows above, over those below."""
+def average_halves(counts, shape, half, near, average, track):  # type: ignore[no-untyped-def]
+    """Write average (rows, peaks, side, direction): half widths averaged over the rows above, over those below.
+
+    And track (rows, peaks, 2): the first and the last row of the run of neighbours a candidate is in.
+    """
     rows = counts.size
     for direction in range(2):
         towards = 1 if direction == 0 else -1
@@ -56,6 +60,7 @@ def average_halves(counts, shape, half, near, average):  # type: ignore[no-untyp
             r = i if direction == 0 else rows - 1 - i
             for k in range(counts[r]):
                 left, right = half[r, k, 0], half[r, k, 1]
+                track[r, k, direction] = r
                 nearest = near
                 for back in range(1, ROWS_BACK + 1):
                     q = r - towards * back
@@ -65,6 +70,7 @@ def average_halves(counts, shape, half, near, average):  # type: ignore[no-untyp
                         moved = abs(shape[q, p, 0] - shape[r, k, 0])
                         if moved < nearest - TIE:
                             nearest = moved
+                            track[r, k, direction] = track[q, p, direction]
                             left = FADING * average[q, p, 0, direction] + (1.0 - FADING) * half[r, k, 0]
                             right = FADING * average[q, p, 1, direction] + (1.0 - FADING) * half[r, k, 1]
                     if nearest < near:
@@ -106,30 +112,28 @@ def mean_of_highest(counts, height):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def cost(moved, rows_on, width, jump, gate):  # type: ignore[no-untyped-def]
-    """What it costs to go ``moved`` px to the side, ``rows_on`` rows further."""
-    if moved > max(gate, TILT * rows_on) + TIE and rows_on > LEAP_ROWS:
+def cost(moved, rows_on, is_step, width, jump, gate):  # type: ignore[no-untyped-def]
+    """What it costs to go ``moved`` px to the side, ``rows_on`` rows further; infinite where only a step may lead."""
+    if moved > max(gate, TILT * rows_on) + TIE and not is_step:
         return np.inf
     widths = moved / width
-    price = min(STIFF * widths, jump + FAR * widths)
-    return price + LEAP if moved > gate + TIE else price
+    return min(STIFF * widths, jump + FAR * widths)
 
 
 @nb.njit(cache=True, nogil=True)
 def find_path(  # type: ignore[no-untyped-def]
-    counts, shape, half, height, widened, expected, factor, width, jump, gate, average, score, back_row, back_peak,
-    alive, chosen,
+    counts, shape, half, height, widened, expected, factor, width, jump, gate, average, track, score, back_row,
+    back_peak, alive, chosen,
 ):  # fmt: skip
     """Choose the candidate of every row that is on the best path, -1 where there is none.
 
     ``expected`` width (px) as the image shows it and the factor it may be off (inf: any); ``width`` of the light, the
-    unit of moving. ``average, score, back_row, back_peak, alive`` are scratch.
+    unit of moving. ``average, track, score, back_row, back_peak, alive`` are scratch.
     """
     rows = counts.size
     chosen[:] = -1
     judged = np.isfinite(factor)
-    if judged:
-        average_halves(counts, shape, half, width, average)
+    average_halves(counts, shape, half, width, average, track)
     bright = BRIGHT * mean_of_highest(counts, height)
     best, end_row, end_peak = 0.0, -1, -1
     living = 0
@@ -146,7 +150,9 @@ def find_path(  # type: ignore[no-untyped-def]
             for s in range(living - 1, -1, -1):  # the latest first: it wins a tie
                 q, p = alive[s, 0], alive[s, 1]
                 moved = abs(shape[r, k, 0] - shape[q, p, 0])
-                through = score[q, p] + earned - cost(moved, r - q, width, jump, gate)
+                starts, ends = track[r, k, 0] >= q - IN_COMMON, track[q, p, 1] <= r + IN_COMMON
+                is_step = starts and ends and r - q <= LEAP_ROWS
+                through = score[q, p] + earned - cost(moved, r - q, is_step, width, jump, gate)
                 if through > value + TIE:
                     value, from_row, from_peak = through, q, p
             score[r, k] = value
@@ -166,7 +172,7 @@ def find_path(  # type: ignore[no-untyped-def]
                     moved = abs(shape[alive[n, 0], alive[n, 1], 0] - shape[q, p, 0])
                     if moved > gate + TIE:
                         continue
-                    if score[alive[n, 0], alive[n, 1]] - cost(moved, 0, width, jump, gate) >= score[q, p]:
+                    if score[alive[n, 0], alive[n, 1]] - cost(moved, 0, False, width, jump, gate) >= score[q, p]:
                         keep = False
                         break
             if keep:

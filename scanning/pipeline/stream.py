@@ -395,7 +395,8 @@ class _Chain:
             np.empty((rows, most, 2), np.int64), np.empty((rows, most, 2)), np.empty((rows, most), np.int64),
             np.zeros(rows, np.int64), np.empty(rows, np.int64),
             np.empty((6, columns), np.int64), np.empty(2 * PLACES, np.int64), np.empty(most, np.int64),
-            np.empty((rows, most, 2)), np.empty((rows, most)), np.empty((rows, most, 2, 2)), np.empty((rows, most)),
+            np.empty((rows, most, 2)), np.empty((rows, most)), np.empty((rows, most, 2, 2)),
+            np.empty((rows, most, 2), np.int64), np.empty((rows, most)),
             np.empty((2, rows, most), np.int64), np.empty((PATHS_ALIVE, 2), np.int64),
         )  # fmt: skip
         self._rows = rows

@@ -357,17 +357,24 @@ def flat_stretches(values: Array) -> list[tuple[int, int]]:
     return list(zip([0, *(e + 1 for e in ends[:-1])], ends, strict=True))
 
 
-def averaged_halves(rows: list[list[Peak]], s: Setting) -> list[list[tuple[float, float]]]:
-    """Half widths left and right of every candidate, averaged over its neighbours above and below."""
+Rows = list[list[int]]
+
+
+def averaged_halves(rows: list[list[Peak]], s: Setting) -> tuple[list[list[tuple[float, float]]], Rows, Rows]:
+    """Half widths left and right of every candidate, averaged over its neighbours above and below.
+
+    And the first and the last row of the run of neighbours it is in.
+    """
 
     def own(peak: Peak) -> Array:
         return np.array(peak.halves if peak.halves is not None else (peak.width / 2, peak.width / 2))
 
-    def one_way(order: list[int]) -> list[list[Array]]:
+    def one_way(order: list[int]) -> tuple[list[list[Array]], Rows]:
         out: list[list[Array]] = [[] for _ in rows]
+        since: Rows = [[] for _ in rows]
         for n, r in enumerate(order):
             for peak in rows[r]:
-                value = own(peak)
+                value, start = own(peak), r
                 for q in order[max(0, n - 3) : n][::-1]:
                     near = [(abs(p.middle - peak.middle), k) for k, p in enumerate(rows[q])]
                     distance, k = s.light_width, -1
@@ -375,19 +382,22 @@ def averaged_halves(rows: list[list[Peak]], s: Setting) -> list[list[tuple[float
                         if d < distance - TIE:
                             distance, k = d, index
                     if k >= 0:
-                        value = 0.8 * out[q][k] + 0.2 * own(peak)
+                        value, start = 0.8 * out[q][k] + 0.2 * own(peak), since[q][k]
                         break
                 out[r].append(value)
-        return out
+                since[r].append(start)
+        return out, since
 
-    down, up = one_way(list(range(len(rows)))), one_way(list(range(len(rows)))[::-1])
-    return [[tuple((a + b) / 2) for a, b in zip(d, u, strict=True)] for d, u in zip(down, up, strict=True)]
+    down, first = one_way(list(range(len(rows))))
+    up, last = one_way(list(range(len(rows)))[::-1])
+    means = [[tuple((a + b) / 2) for a, b in zip(d, u, strict=True)] for d, u in zip(down, up, strict=True)]
+    return means, first, last
 
 
 def best_path(rows: list[list[Peak]], s: Setting) -> list[int]:
     """Every candidate against every earlier one; latest row first, there the higher column first, wins a tie."""
     earned: dict[tuple[int, int], float] = {}
-    averages = averaged_halves(rows, s)
+    averages, first, last = averaged_halves(rows, s)
     highest = [max(p.height for p in peaks) for peaks in rows if peaks]
     bright = sum(highest) / len(highest) / 4 if highest else 1.0
     for r, peaks in enumerate(rows):
@@ -408,10 +418,10 @@ def best_path(rows: list[list[Peak]], s: Setting) -> list[int]:
 
     def price(a: tuple[int, int], b: tuple[int, int]) -> float:
         moved, rows_on = sideways(a, b), abs(b[0] - a[0])
-        if moved > max(s.gate_max, 0.6 * rows_on) + TIE and rows_on > 16:
+        is_step = rows_on <= 16 and first[b[0]][b[1]] >= a[0] - 2 and last[a[0]][a[1]] <= b[0] + 2
+        if moved > max(s.gate_max, 0.6 * rows_on) + TIE and not is_step:
             return math.inf
-        leap = 30.0 if moved > s.gate_max + TIE else 0.0
-        return min(moved / s.light_width, s.jump + 0.3 * moved / s.light_width) + leap
+        return min(moved / s.light_width, s.jump + 0.3 * moved / s.light_width)
 
     def stays(old: tuple[int, int], new: tuple[int, int]) -> bool:
         moved = sideways(old, new)
