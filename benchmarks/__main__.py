@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import sys
 
-from benchmarks import precision
+from benchmarks import damage, precision
 
-QUESTIONS = {"precision": precision.main}
+QUESTIONS = {"precision": precision.main, "damage": damage.main}
 
 
 def main() -> int:
