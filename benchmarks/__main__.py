@@ -1,12 +1,12 @@
-"""`python -m benchmarks precision`: one small harness per question, each printing one Markdown table."""
+"""`python -m benchmarks QUESTION`: one small harness per question, each printing one Markdown table."""
 
 from __future__ import annotations
 
 import sys
 
-from benchmarks import damage, precision
+from benchmarks import damage, precision, speed
 
-QUESTIONS = {"precision": precision.main, "damage": damage.main}
+QUESTIONS = {"precision": precision.main, "damage": damage.main, "speed": speed.main}
 
 
 def main() -> int:
