@@ -17,8 +17,8 @@ _HOMES = {
     "RangeImage": "scanning.range_image",
     "Profile": "scanning.pipeline.stream",
     "ProfileStream": "scanning.pipeline.stream",
-    "extract_profile": "scanning.pipeline.stream",
-    "process_stack": "scanning.pipeline.stream",
+    "extract_profile": "scanning.pipeline.whole",
+    "process_stack": "scanning.pipeline.whole",
     "open_stack": "scanning.stacks",
     "inspect_surface": "scanning.surface",
     "BadInput": "scanning.errors",
@@ -41,7 +41,8 @@ __all__ = [
 if TYPE_CHECKING:
     from scanning.errors import BadInput
     from scanning.frames import Stack, StackHeader
-    from scanning.pipeline.stream import Profile, ProfileStream, extract_profile, process_stack
+    from scanning.pipeline.stream import Profile, ProfileStream
+    from scanning.pipeline.whole import extract_profile, process_stack
     from scanning.range_image import RangeImage
     from scanning.recipe import Recipe
     from scanning.stacks import open_stack

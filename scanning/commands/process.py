@@ -37,7 +37,7 @@ def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     from scanning.calibration import read_calibration
     from scanning.exchange import WRITERS
     from scanning.pipeline import warm_up
-    from scanning.pipeline.stream import process_stack
+    from scanning.pipeline.whole import process_stack
     from scanning.precision import precision_of, read_flat
     from scanning.recipe import Recipe
     from scanning.report import processing_report, write_results

@@ -1,7 +1,8 @@
 """The paper's pipeline, one file per operation, in the order the data flows.
 
 compound.py (SCI), exposure.py (HDRE), tone.py (GLT), line.py (MSNN, with standing_out.py and path.py), centroid.py
-(COG); stream.py composes them.
+(COG). settle.py says what to work with, chain.py composes the operations, stream.py takes frames and gives profiles,
+whole.py does whole stacks.
 
 Compiled kernels are kept under a name made of all the sources here. Numba itself looks only at the file a kernel is
 written in: after an update that changed a kernel called from another file it would go on using the old one, and give

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scanning.pipeline.stream import extract_profile
+from scanning.pipeline.whole import extract_profile
 from scanning.recipe import Recipe
 from tests.scanning.pipeline.scenes import line, shot, speckle
 

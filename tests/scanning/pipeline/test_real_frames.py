@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scanning.pipeline.stream import ProfileStream, extract_profile
+from scanning.pipeline.stream import ProfileStream
+from scanning.pipeline.whole import extract_profile
 from scanning.recipe import Recipe
 from tests.scanning.pipeline.agreement import header_for, product
 

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from scanning.errors import BadInput
 from scanning.frames import StackHeader
 from scanning.pipeline.estimate import half_sample_mode
-from scanning.pipeline.stream import ProfileStream, extract_profile, process_stack
+from scanning.pipeline.stream import ProfileStream
+from scanning.pipeline.whole import extract_profile, process_stack
 from scanning.recipe import Recipe
 from scanning.rig.protocols import Image
 from tests.scanning.pipeline.agreement import Steps, header_for, product

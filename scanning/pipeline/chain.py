@@ -1,0 +1,180 @@
+"""A recipe's operations in its order, one stage position at a time, on scratch arrays that keep their size."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanning.frames import StackHeader
+from scanning.pipeline.compound import CompoundWindow
+from scanning.pipeline.exposure import exposure_grey, fuse_codes, fuse_sums, look_up
+from scanning.pipeline.grey import DARK_UNIT
+from scanning.pipeline.line import extract_line
+from scanning.pipeline.settle import GRAIN_PX, Settled
+from scanning.pipeline.standing_out import PLACES, box_for
+from scanning.pipeline.tone import GREY_TOP, fixed_point, grey_bits, scaled_codes, tone
+from scanning.recipe import Recipe
+from scanning.rig.protocols import Image
+
+REACH = 2.2
+"""Line widths the base reaches to either side at most."""
+PATHS_ALIVE = 1024
+INT32_TOP = (1 << 31) - 1
+Float64 = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Int32 = NDArray[np.int32]
+
+
+class Chain:
+    """The recipe's operations in its order, on scratch arrays that keep their size."""
+
+    def __init__(self, recipe: Recipe, header: StackHeader, settled: Settled, selected: list[int]) -> None:
+        rows, columns = header.rows, header.columns
+        self.selected = selected
+        self._saturation = header.saturation
+        sci, hdre, glt, line = recipe.compound, recipe.hdre, recipe.tone, recipe.line
+        window = sci.window if sci is not None else 1
+        self._window = window
+        sci_first = recipe.comes_before("sci", "hdre") or (hdre is None and recipe.comes_before("sci", "glt"))
+        self._tone_p = glt.p if glt is not None else None
+        # GLT on sums of fused images meets values that no table holds.
+        self._tone_last = hdre is not None and recipe.comes_before("hdre", "sci") and recipe.comes_before("sci", "glt")
+        self._bits = grey_bits(window)
+
+        self._tables: Int32 | None = None
+        if hdre is not None or glt is not None:
+            codes = np.arange(header.saturation * (window if sci_first else 1) + 1) / (window if sci_first else 1)
+            if hdre is not None:
+                grey = exposure_grey(codes, settled.exposures_us, settled.dark_levels, header.saturation)
+            else:
+                grey = scaled_codes(codes, settled.dark_levels[0], header.saturation)[np.newaxis]
+            if glt is not None and not self._tone_last:
+                grey = tone(grey, glt.p)
+            if hdre is not None:
+                grey[0, -1] = GREY_TOP
+            self._tables = fixed_point(grey, self._bits)
+        self._fuses = hdre is not None
+        self._saturated_from = window if hdre is None or hdre.saturated == "all" else 1
+
+        # In front of SCI, behind it, or (no SCI) the only stage: where the tables are applied.
+        self._table_first = self._tables is not None and not sci_first
+        self._table_behind = self._tables is not None and sci_first
+        self._windows: list[CompoundWindow] = []
+        if sci is not None:
+            sliding = sci.mode == "sliding"
+            counting = self._fuses and sci_first
+            top = INT32_TOP if self._table_first else header.saturation
+            channels = len(selected) if counting else 1
+            self._windows = [
+                CompoundWindow(rows, columns, window, sliding=sliding, top=top, counting=counting)
+                for _ in range(channels)
+            ]
+        self._fused: Int32 = np.zeros((rows, columns) if self._tables is not None else (0, 0), np.int32)
+
+        # What extract_line must know about the integers it gets (see grey.grey), and one grey level in its unit.
+        if self._tables is not None:
+            self._top, self._scale, self._dark = INT32_TOP, 1, 0
+            self._grey_level = float((1 << self._bits) * (1 if not self._table_first else window))
+        else:
+            self._top, self._scale = header.saturation * window, DARK_UNIT
+            self._dark = round(settled.dark_levels[0] * DARK_UNIT) * window
+            self._grey_level = float(DARK_UNIT * window)
+        if self._tone_last:
+            self._grey_level = float(1 << 20)
+
+        width = settled.expected_width_px
+        unit = line.width_px or settled.line_width_px or GRAIN_PX
+        box = box_for(width)
+        self._line = (
+            settled.candidates == "noise", settled.continuity == "path", settled.k, settled.floor,
+            line.floor_from == "row_mean", line.ceiling, settled.snr, settled.grain_px,
+            1.0 if width is None else width, np.inf if width is None else line.width_factor,
+            line.gate_px, line.gate_max_px, line.seed == "best", unit, line.jump, math.ceil(REACH * unit), box,
+        )  # fmt: skip
+        most = columns // 2 + 1
+        self._scratch = (  # light, base, shape, height, counts, chosen, and for noise and path: see their files
+            np.empty(rows, np.int64),
+            np.empty((rows, most, 2), np.int64), np.empty((rows, most, 2)), np.empty((rows, most), np.int64),
+            np.zeros(rows, np.int64), np.empty(rows, np.int64),
+            np.empty((6, columns), np.int64), np.empty(2 * PLACES, np.int64), np.empty(most, np.int64),
+            np.empty((rows, most, 2)), np.empty((rows, most)), np.empty((rows, most, 2, 2)),
+            np.empty((rows, most, 2), np.int64), np.empty((rows, most)),
+            np.empty((2, rows, most), np.int64), np.empty((PATHS_ALIVE, 2), np.int64),
+        )  # fmt: skip
+        self._rows = rows
+
+    def run(self, images: list[Image]) -> tuple[Float64, Float32, Float32] | None:
+        """(column_px, intensity, width_px) once enough images are in, else None."""
+        image: NDArray[Any] = images[0]
+        self._last = images[0]
+        if self._table_first:
+            self._apply_tables(images)
+            image = self._fused
+        if self._windows:
+            inputs = [image] if len(self._windows) == 1 else images
+            sums = [window.add(one) for window, one in zip(self._windows, inputs, strict=True)]
+            full = [s for s in sums if s is not None]
+            if not full:
+                return None
+            image = full[0]
+            if self._table_behind:
+                self._apply_tables_to_sums(full)
+                image = self._fused
+            elif self._tone_last:
+                assert self._tone_p is not None
+                mean = image / float(self._window << self._bits)
+                image = fixed_point(tone(mean, self._tone_p), 20)
+        highest = np.empty(self._rows, image.dtype)
+        column_px = np.empty(self._rows)
+        peak = np.empty(self._rows)
+        width_px = np.empty(self._rows)
+        extract_line(
+            image, self._top, self._scale, self._dark, *self._line, highest, *self._scratch, column_px, peak, width_px
+        )
+        return column_px, (peak / self._grey_level).astype(np.float32), width_px.astype(np.float32)
+
+    @property
+    def single(self) -> NDArray[Any]:
+        """The image of the last stage position before SCI; only lent."""
+        return self._fused if self._table_first else self._last
+
+    @property
+    def single_grey(self) -> tuple[int, int, int]:
+        """(top, scale, dark) of `single`; see `grey.grey`."""
+        if self._table_first:
+            return INT32_TOP, 1, 0
+        return self._saturation, DARK_UNIT, self._dark // self._window
+
+    def bases(self) -> tuple[NDArray[np.int64], Float64]:
+        """Of the last profile's line: first and last column (rows, 2), and the pedestal in light of one image."""
+        base, chosen, pedestal = self._scratch[1], self._scratch[5], self._scratch[10]
+        rows, at = np.arange(self._rows), np.maximum(chosen, 0)
+        level = pedestal[rows, at] / self._window if self._line[0] else np.zeros(self._rows)
+        return base[rows, at], level
+
+    def candidates(self) -> tuple[Float64, Float64]:
+        shape, counts, chosen = self._scratch[2], self._scratch[4], self._scratch[5]
+        pairs = [(r, float(shape[r, k, 0]), k == chosen[r]) for r in range(self._rows) for k in range(counts[r])]
+        taken = np.array([(r, c) for r, c, is_line in pairs if is_line], dtype=np.float64).reshape(-1, 2)
+        rejected = np.array([(r, c) for r, c, is_line in pairs if not is_line], dtype=np.float64).reshape(-1, 2)
+        return taken, rejected
+
+    def _apply_tables(self, images: list[Image]) -> None:
+        assert self._tables is not None
+        if not self._fuses:
+            look_up(self._fused, images[0], self._tables[0], self._saturation)
+            return
+        for e, image in enumerate(images):
+            fuse_codes(self._fused, image, self._tables[e], self._saturation, e == 0)
+
+    def _apply_tables_to_sums(self, sums: list[Int32]) -> None:
+        assert self._tables is not None
+        if not self._fuses:
+            look_up(self._fused, sums[0], self._tables[0], self._saturation * self._window)
+            return
+        top = int(self._tables[0, -1])
+        for e, one in enumerate(sums):
+            fuse_sums(self._fused, one, self._tables[e], self._saturated_from, top, e == 0)
