@@ -14,7 +14,7 @@ from scanning.pipeline.exposure import exposure_grey, fuse_codes, fuse_sums, loo
 from scanning.pipeline.grey import DARK_UNIT
 from scanning.pipeline.line import extract_line
 from scanning.pipeline.settle import GRAIN_PX, Settled
-from scanning.pipeline.standing_out import PLACES, box_for
+from scanning.pipeline.smoothing import ROWS_LOOKED_AT, WORD, Rows, box_for, kind_for
 from scanning.pipeline.tone import GREY_TOP, fixed_point, grey_bits, scaled_codes, tone
 from scanning.recipe import Recipe
 from scanning.rig.protocols import Image
@@ -22,10 +22,59 @@ from scanning.rig.protocols import Image
 REACH = 2.2
 """Line widths the base reaches to either side at most."""
 PATHS_ALIVE = 1024
+FEW = 4
+"""Candidates of a row there is room for at first."""
 INT32_TOP = (1 << 31) - 1
 Float64 = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 Int32 = NDArray[np.int32]
+
+
+class Scratch:
+    """Where one image's candidates and paths are kept: as small as they are, because memory touched is time.
+
+    A row may have a candidate in every other column, but hardly any has more than a few; room for the most seen so far
+    is enough, and is made larger when a row has more.
+    """
+
+    def __init__(self, rows: int, columns: int, box: int, kind: Any) -> None:
+        most = columns // 2 + 1
+        of_one = Rows(columns, box, kind)
+        self._of_one = (of_one.three, of_one.once, of_one.smooth, of_one.looked_at)
+        self._of_row = (
+            np.empty((most, 2), np.int64), np.empty((most, 2)), np.empty((most, 2)), np.empty(most, np.int64),
+            np.empty(most),
+        )  # fmt: skip
+        self._light = np.empty(rows, np.int64)
+        self._noise = np.empty(ROWS_LOOKED_AT * columns, np.int64)
+        self._maxima = np.empty(most, np.int64)
+        self._lit = np.zeros(-(-columns // WORD), np.uint64)
+        self._alive = np.empty((PATHS_ALIVE, 2), np.int64)
+        self.counts = np.zeros(rows, np.int64)
+        self.chosen = np.empty(rows, np.int64)
+        self._rows = rows
+        self.make_room_for(FEW)
+
+    def make_room_for(self, most: int) -> None:
+        rows, self.most = self._rows, most
+        self.base, self.shape = np.zeros((rows, most, 2), np.int64), np.zeros((rows, most, 2))
+        self.half, self.height, self.pedestal = (
+            np.zeros_like(self.shape),
+            np.zeros((rows, most), np.int64),
+            np.zeros((rows, most)),
+        )
+        self._of_path = (
+            np.empty((rows, most, 2, 2)), np.empty((rows, most, 2), np.int64), np.empty((rows, most)),
+            np.empty((rows, most), np.int64), np.empty((rows, most), np.int64), self._alive,
+        )  # fmt: skip
+
+    def arrays(self) -> tuple[Any, ...]:
+        """What `extract_line` wants, in its order."""
+        of_rows = (self.base, self.shape, self.half, self.height, self.pedestal)
+        return (
+            self._light, self._of_one, self._noise, self._maxima, self._lit, self._of_row, of_rows, self.counts,
+            self.chosen, self._of_path,
+        )  # fmt: skip
 
 
 class Chain:
@@ -76,14 +125,17 @@ class Chain:
 
         # What extract_line must know about the integers it gets (see grey.grey), and one grey level in its unit.
         if self._tables is not None:
-            self._top, self._scale, self._dark = INT32_TOP, 1, 0
-            self._grey_level = float((1 << self._bits) * (1 if not self._table_first else window))
+            summed = window if self._table_first else 1
+            self._top, self._scale, self._dark = int(GREY_TOP) * summed << self._bits, 1, 0
+            self._grey_level = float(summed << self._bits)
         else:
-            self._top, self._scale = header.saturation * window, DARK_UNIT
-            self._dark = round(settled.dark_levels[0] * DARK_UNIT) * window
-            self._grey_level = float(DARK_UNIT * window)
+            # The dark level as a whole number: the smaller its unit, the narrower the integers of all that follows.
+            dark = round(settled.dark_levels[0] * DARK_UNIT)
+            self._scale = DARK_UNIT // math.gcd(dark, DARK_UNIT)
+            self._top, self._dark = header.saturation * window, dark * self._scale // DARK_UNIT * window
+            self._grey_level = float(self._scale * window)
         if self._tone_last:
-            self._grey_level = float(1 << 20)
+            self._top, self._grey_level = int(GREY_TOP) << 20, float(1 << 20)
 
         width = settled.expected_width_px
         unit = line.width_px or settled.line_width_px or GRAIN_PX
@@ -94,16 +146,7 @@ class Chain:
             1.0 if width is None else width, np.inf if width is None else line.width_factor,
             line.gate_px, line.gate_max_px, line.seed == "best", unit, line.jump, math.ceil(REACH * unit), box,
         )  # fmt: skip
-        most = columns // 2 + 1
-        self._scratch = (  # light, base, shape, height, counts, chosen, and for noise and path: see their files
-            np.empty(rows, np.int64),
-            np.empty((rows, most, 2), np.int64), np.empty((rows, most, 2)), np.empty((rows, most), np.int64),
-            np.zeros(rows, np.int64), np.empty(rows, np.int64),
-            np.empty((6, columns), np.int64), np.empty(2 * PLACES, np.int64), np.empty(most, np.int64),
-            np.empty((rows, most, 2)), np.empty((rows, most)), np.empty((rows, most, 2, 2)),
-            np.empty((rows, most, 2), np.int64), np.empty((rows, most)),
-            np.empty((2, rows, most), np.int64), np.empty((PATHS_ALIVE, 2), np.int64),
-        )  # fmt: skip
+        self._scratch = Scratch(rows, columns, box, kind_for(box, self._top, self._scale))
         self._rows = rows
 
     def run(self, images: list[Image]) -> tuple[Float64, Float32, Float32] | None:
@@ -127,13 +170,17 @@ class Chain:
                 assert self._tone_p is not None
                 mean = image / float(self._window << self._bits)
                 image = fixed_point(tone(mean, self._tone_p), 20)
+        column_px, peak, width_px = np.empty((3, self._rows))
+        scratch = self._scratch
         highest = np.empty(self._rows, image.dtype)
-        column_px = np.empty(self._rows)
-        peak = np.empty(self._rows)
-        width_px = np.empty(self._rows)
-        extract_line(
-            image, self._top, self._scale, self._dark, *self._line, highest, *self._scratch, column_px, peak, width_px
-        )
+        while True:
+            most = extract_line(
+                image, self._top, self._scale, self._dark, *self._line, highest, *scratch.arrays(), column_px, peak,
+                width_px,
+            )  # fmt: skip
+            if most <= scratch.most:
+                break
+            scratch.make_room_for(most)
         return column_px, (peak / self._grey_level).astype(np.float32), width_px.astype(np.float32)
 
     @property
@@ -146,17 +193,17 @@ class Chain:
         """(top, scale, dark) of `single`; see `grey.grey`."""
         if self._table_first:
             return INT32_TOP, 1, 0
-        return self._saturation, DARK_UNIT, self._dark // self._window
+        return self._saturation, self._scale, self._dark // self._window
 
     def bases(self) -> tuple[NDArray[np.int64], Float64]:
         """Of the last profile's line: first and last column (rows, 2), and the pedestal in light of one image."""
-        base, chosen, pedestal = self._scratch[1], self._scratch[5], self._scratch[10]
+        base, chosen, pedestal = self._scratch.base, self._scratch.chosen, self._scratch.pedestal
         rows, at = np.arange(self._rows), np.maximum(chosen, 0)
         level = pedestal[rows, at] / self._window if self._line[0] else np.zeros(self._rows)
         return base[rows, at], level
 
     def candidates(self) -> tuple[Float64, Float64]:
-        shape, counts, chosen = self._scratch[2], self._scratch[4], self._scratch[5]
+        shape, counts, chosen = self._scratch.shape, self._scratch.counts, self._scratch.chosen
         pairs = [(r, float(shape[r, k, 0]), k == chosen[r]) for r in range(self._rows) for k in range(counts[r])]
         taken = np.array([(r, c) for r, c, is_line in pairs if is_line], dtype=np.float64).reshape(-1, 2)
         rejected = np.array([(r, c) for r, c, is_line in pairs if not is_line], dtype=np.float64).reshape(-1, 2)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scanning.pipeline.centroid import centre_of_gravity
 from scanning.pipeline.grey import DARK_UNIT
 from scanning.pipeline.line import half_width, lowest_code_above, row_light, row_maxima, row_peaks
+from scanning.pipeline.smoothing import WORD
 
 PIXELS_LOOKED_AT = 1 << 16
 FEWEST_ROWS = 8
@@ -74,6 +75,7 @@ def line_width_px(
         if ceiling > 0:
             asked = min(asked, ceiling * float(maxima.mean()))
         most = columns // 2 + 1
+        lit = np.zeros(-(-columns // WORD), np.uint64)
         base, shape, height = np.empty((most, 2), np.int64), np.empty((most, 2)), np.empty(most, np.int64)
         for r in range(rows):
             background = float(light[r]) / columns
@@ -81,7 +83,7 @@ def line_width_px(
             lowest = lowest_code_above(threshold, DARK_UNIT, level)
             if min(int(highest[r]), saturation) < lowest:
                 continue
-            found = row_peaks(image[r], lowest, 0.0, GRAIN_PX, saturation, DARK_UNIT, level, base, shape, height)
+            found = row_peaks(image[r], lowest, 0.0, GRAIN_PX, saturation, DARK_UNIT, level, lit, base, shape, height)
             best = int(np.argmax(height[:found]))
             heights.append(float(height[best]))
             first, last = int(base[best, 0]), int(base[best, 1])

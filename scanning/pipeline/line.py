@@ -37,15 +37,10 @@ import numpy as np
 from scanning.pipeline.centroid import centre_above, centre_of_gravity
 from scanning.pipeline.grey import grey
 from scanning.pipeline.path import find_path
-from scanning.pipeline.standing_out import BOX_WIDENS, level_and_spread, light_of_row, row_candidates, smooth_row
+from scanning.pipeline.smoothing import WORD, level_and_spread, mark_lit, noise_of, smooth_row
+from scanning.pipeline.standing_out import BOX_WIDENS, row_candidates
 
-BLOCK = 64
-"""Columns looked at together: a block without a pixel above the threshold is skipped whole."""
 LINES_TRIED = 16
-NOISE_PLACES = 1024
-SPREAD = 2_654_435_761
-"""Multiples of this prime, wrapped, fall all over the image and never in step with its columns."""
-NOISE_PER_STEP = 1.4826 / np.sqrt(2.0)
 TIE = 1e-9
 """Costs closer than this (px) are equal; rounding must not decide between two equal candidates."""
 STRICT = 1.0 + 1e-12
@@ -114,23 +109,20 @@ def half_width(row, first, last, height, top, scale, dark):  # type: ignore[no-u
 
 
 @nb.njit(cache=True, nogil=True)
-def row_peaks(row, lowest, faint, grain_px, top, scale, dark, base, shape, height):  # type: ignore[no-untyped-def]
+def row_peaks(row, lowest, faint, grain_px, top, scale, dark, lit, base, shape, height):  # type: ignore[no-untyped-def]
     """Find the peaks of one row, from low to high columns; return how many.
 
     ``lowest`` is the smallest code above the threshold; peaks no higher than ``faint`` are left out. Written per peak:
-    base (first, last), shape (position, width) in px, height in light.
+    base (first, last), shape (position, width) in px, height in light. ``lit`` is scratch, a byte per column.
     """
     columns = row.size
+    mark_lit(row, lowest, lit)
     found = 0
     c = 0
     while c < columns:
-        if c % BLOCK == 0 and c + BLOCK <= columns:
-            most = row[c]
-            for b in range(c + 1, c + BLOCK):
-                most = max(most, row[b])
-            if most < lowest:
-                c += BLOCK
-                continue
+        if c % WORD == 0 and lit[c // WORD] == 0:
+            c += WORD
+            continue
         if row[c] < lowest:
             c += 1
             continue
@@ -293,28 +285,24 @@ def find_line(counts, shape, height, expected, factor, gate_px, gate_max_px, bes
 
 
 @nb.njit(cache=True, nogil=True)
-def noise_of(image, top, scale):  # type: ignore[no-untyped-def]
-    """Noise of a pixel (standard deviation, in light): 1.4826 / sqrt 2 x the median step between neighbouring columns.
-
-    The median over 1024 places spread over the image does not see the line, which covers a small part of it.
-    """
-    rows, columns = image.shape
-    places = rows * (columns - 1)
-    count = min(places, NOISE_PLACES)
-    steps = np.empty(count, np.int64)
-    for i in range(count):
-        place = (i * SPREAD) % places
-        r, c = place // (columns - 1), place % (columns - 1)
-        steps[i] = abs(min(np.int64(image[r, c + 1]), top) - min(np.int64(image[r, c]), top))
-    return NOISE_PER_STEP * np.partition(steps, count // 2)[count // 2] * scale
+def keep(r, count, of_row, of_rows):  # type: ignore[no-untyped-def]
+    """Copy the candidates of one row out of its scratch to where those of all rows are kept, if there is room."""
+    base, shape, half, height, pedestal = of_rows
+    if count > height.shape[1]:
+        return
+    for k in range(count):
+        base[r, k, 0], base[r, k, 1] = of_row[0][k, 0], of_row[0][k, 1]
+        shape[r, k, 0], shape[r, k, 1] = of_row[1][k, 0], of_row[1][k, 1]
+        half[r, k, 0], half[r, k, 1] = of_row[2][k, 0], of_row[2][k, 1]
+        height[r, k], pedestal[r, k] = of_row[3][k], of_row[4][k]
 
 
 @nb.njit(cache=True, nogil=True)
 def candidates_by_threshold(  # type: ignore[no-untyped-def]
-    image, top, scale, dark, k, floor, from_row_mean, ceiling, faint, grain_px, highest, light, base, shape, height,
+    image, top, scale, dark, k, floor, from_row_mean, ceiling, faint, grain_px, highest, light, lit, of_row, of_rows,
     counts,
 ):  # fmt: skip
-    """The peaks of every row above the paper's threshold."""
+    """The peaks of every row above the paper's threshold; see `keep`. Returns the most in one row."""
     rows, columns = image.shape
     row_maxima(image, highest)
     row_light(image, top, scale, dark, light)
@@ -325,71 +313,76 @@ def candidates_by_threshold(  # type: ignore[no-untyped-def]
         for r in range(rows):
             of_maxima += grey(highest[r], top, scale, dark)
         asked = min(asked, ceiling * (of_maxima / rows))
+    base, shape, half, height, _ = of_row
+    most = 0
     for r in range(rows):
         background = light[r] / columns if from_row_mean else 0.0
         threshold = max(asked, background + floor * (grey(highest[r], top, scale, dark) - background))
         lowest = lowest_code_above(threshold, scale, dark)
         counts[r] = 0
         if min(np.int64(highest[r]), top) >= lowest:
-            counts[r] = row_peaks(image[r], lowest, faint, grain_px, top, scale, dark, base[r], shape[r], height[r])
+            counts[r] = row_peaks(image[r], lowest, faint, grain_px, top, scale, dark, lit, base, shape, height)
+            for p in range(counts[r]):
+                half[p, 0] = half[p, 1] = 0.5 * shape[p, 1]
+            keep(r, counts[r], of_row, of_rows)
+            most = max(most, counts[r])
+    return most
 
 
 @nb.njit(cache=True, nogil=True)
 def candidates_by_noise(  # type: ignore[no-untyped-def]
-    image, top, scale, dark, floor, from_row_mean, snr, faint, grain_px, reach, box, rows_of, seen, maxima,
-    base, shape, half, height, pedestal, counts,
+    image, top, scale, dark, floor, from_row_mean, snr, faint, grain_px, reach, box, of_one, maxima, lit, of_row,
+    of_rows, counts,
 ):  # fmt: skip
-    """What stands out of the noise in every row; see standing_out.py."""
-    level, spread = level_and_spread(image, box, top, scale, dark, seen)
-    rows = image.shape[0]
-    three, once, smooth = rows_of[3], rows_of[4], rows_of[5]
-    light_of_row(image, 0, top, scale, dark, rows_of[0])
-    for r in range(rows):
-        if r + 1 < rows:
-            light_of_row(image, r + 1, top, scale, dark, rows_of[(r + 1) % 3])
-        above, below = max(r - 1, 0) % 3, min(r + 1, rows - 1) % 3
-        smooth_row(rows_of[above], rows_of[r % 3], rows_of[below], box, three, once, smooth)
+    """What stands out of the noise in every row; see standing_out.py. Returns the most in one row."""
+    three, once, smooth, looked_at = of_one
+    level, spread = level_and_spread(image, box, top, scale, dark, three, once, smooth, looked_at)
+    base, shape, half, height, pedestal = of_row
+    most = 0
+    for r in range(image.shape[0]):
+        smooth_row(image, r, box, top, scale, dark, three, once, smooth)
         counts[r] = row_candidates(
             image[r], smooth, level, spread, snr, faint, floor, from_row_mean, grain_px, reach, box, top, scale, dark,
-            maxima, base[r], shape[r], half[r], height[r], pedestal[r],
+            lit, maxima, base, shape, half, height, pedestal,
         )  # fmt: skip
+        keep(r, counts[r], of_row, of_rows)
+        most = max(most, counts[r])
+    return most
 
 
 @nb.njit(cache=True, nogil=True)
 def extract_line(  # type: ignore[no-untyped-def]
     image, top, scale, dark, by_noise, by_path, k, floor, from_row_mean, ceiling, snr, grain_px, expected, factor,
     gate_px, gate_max_px, best_seed, light_width, jump, reach, box,
-    highest, light, base, shape, height, counts, chosen, rows_of, seen, maxima, half, pedestal, average, track, score,
-    back, alive,
-    column_px, peak, width_px,
+    highest, light, of_one, noise, maxima, lit, of_row, of_rows, counts, chosen, of_path, column_px, peak, width_px,
 ):  # fmt: skip
     """MSNN then COG on one (rows, columns) image of integer codes (see `grey.grey` for top, scale, dark).
 
     Writes, per row, column_px (px from 0, NaN undefined), peak (light of the line's maximum) and width_px (full width
-    at half maximum, px). What lies between ``box`` and ``column_px`` is scratch that keeps its size.
+    at half maximum, px), and returns the most candidates in one row. If the scratch has no room for so many, nothing is
+    written. What lies between ``box`` and ``column_px`` is scratch that keeps its size; see `chain.Scratch`.
     """
     rows = image.shape[0]
-    faint = snr * noise_of(image, top, scale) * STRICT if snr > 0.0 else 0.0
+    faint = snr * noise_of(image, top, scale, noise) * STRICT if snr > 0.0 else 0.0
     if by_noise:
-        candidates_by_noise(
-            image, top, scale, dark, floor, from_row_mean, snr, faint, grain_px, reach, box, rows_of, seen, maxima,
-            base, shape, half, height, pedestal, counts,
+        most = candidates_by_noise(
+            image, top, scale, dark, floor, from_row_mean, snr, faint, grain_px, reach, box, of_one, maxima, lit,
+            of_row, of_rows, counts,
         )  # fmt: skip
     else:
-        candidates_by_threshold(
-            image, top, scale, dark, k, floor, from_row_mean, ceiling, faint, grain_px, highest, light, base, shape,
-            height, counts,
+        most = candidates_by_threshold(
+            image, top, scale, dark, k, floor, from_row_mean, ceiling, faint, grain_px, highest, light, lit, of_row,
+            of_rows, counts,
         )  # fmt: skip
+    base, shape, half, height, pedestal = of_rows
+    if most > height.shape[1]:
+        return most
     if by_path:
-        widened = BOX_WIDENS * (box * box - 1)
-        if not by_noise:
-            widened = 0.0
-            for r in range(rows):
-                for p in range(counts[r]):
-                    half[r, p, :] = 0.5 * shape[r, p, 1]
+        widened = BOX_WIDENS * (box * box - 1) if by_noise else 0.0
+        average, track, score, back_row, back_peak, alive = of_path
         find_path(
             counts, shape, half, height, widened, expected, factor, light_width, jump, gate_max_px, average, track,
-            score, back[0], back[1], alive, chosen,
+            score, back_row, back_peak, alive, chosen,
         )  # fmt: skip
     else:
         find_line(counts, shape, height, expected, factor, gate_px, gate_max_px, best_seed, chosen)
@@ -407,3 +400,4 @@ def extract_line(  # type: ignore[no-untyped-def]
                 column_px[r] = centre_of_gravity(image[r], first, last, top, scale, dark)
             peak[r] = height[r, peak_of_row]
             width_px[r] = shape[r, peak_of_row, 1]
+    return most

@@ -4,9 +4,8 @@ The paper's threshold is a share of the brightest thing: a reflection three time
 altogether, and no choice made afterwards can bring it back (on a scene with dark zones the line was missing among the
 candidates in 60 % of the rows beside a reflection). Noise is the same in every row, so it is the fair measure.
 
-1. The light is smoothed: three rows (coherent light makes grains about a row high, and a row whose grain is dark still
-   has its line) by a triangle across the columns as wide as the line (two boxes of ``box`` columns).
-2. Level and spread of the smoothed light off the line come from 1024 places all over the image (`level_and_spread`).
+1. The light is smoothed: three rows by a triangle across the columns as wide as the line (smoothing.py).
+2. Level and spread of the smoothed light off the line come from rows all over the image (`level_and_spread`).
    A candidate is a maximum more than ``snr`` spreads above that level, and in its own row its highest pixel is above
    the noise of one pixel: at a step of the surface the neighbour's line must not lend its light to this row.
 3. Two maxima are grains of one line when they are ``grain_px`` or less apart, or when the valley between them is
@@ -25,14 +24,8 @@ import numba as nb
 import numpy as np
 
 from scanning.pipeline.grey import grey
+from scanning.pipeline.smoothing import WORD, mark_lit, total_of
 
-PLACES = 1024
-WIDEST_BOX = 15
-"""Grains and noise are a few pixels wide, however wide the line."""
-SPREAD_OF_PLACES = 2_654_435_761
-STEP_TO_SIGMA = 1.4826 / np.sqrt(2.0)
-BLOCK = 32
-"""Columns looked at together: a block with nothing above the noise is skipped whole."""
 SHALLOW = 0.8
 """A valley above this share of the lower of its two maxima does not part them."""
 NOISE_AT_THE_FOOT = 1.5
@@ -41,92 +34,10 @@ BOX_WIDENS = 2.0 * np.log(2.0) * 4.0 / 6.0
 """Two boxes of b columns add this times (b^2 - 1) to the square of a Gaussian's full width at half maximum."""
 
 
-def box_for(width_px: float | None) -> int:
-    """Columns of the smoothing box for a line this wide: odd, from 3."""
-    if width_px is None:
-        return 3
-    return min(WIDEST_BOX, max(3, 2 * int(width_px / 2.0) + 1))
-
-
-@nb.njit(cache=True, nogil=True)
-def light_of_row(image, r, top, scale, dark, out):  # type: ignore[no-untyped-def]
-    """The light of row r, int64."""
-    for c in range(image.shape[1]):
-        out[c] = grey(image[r, c], top, scale, dark)
-
-
-@nb.njit(cache=True, nogil=True)
-def smooth_row(above, own, below, box, three, once, smooth):  # type: ignore[no-untyped-def]
-    """Write the smoothed light of a row from the light of three; all int64 and exact. Outside the image it is dark."""
-    for c in range(own.size):
-        three[c] = above[c] + own[c] + below[c]
-    _box(three, box, once)
-    _box(once, box, smooth)
-
-
-@nb.njit(cache=True, nogil=True)
-def _box(values, box, out):  # type: ignore[no-untyped-def]
-    columns = values.size
-    half = box // 2
-    if half == 1 and columns > 2:
-        out[0] = values[0] + values[1]
-        for c in range(1, columns - 1):
-            out[c] = values[c - 1] + values[c] + values[c + 1]
-        out[columns - 1] = values[columns - 2] + values[columns - 1]
-        return
-    total = np.int64(0)
-    for c in range(min(half, columns)):
-        total += values[c]
-    for c in range(columns):
-        if c + half < columns:
-            total += values[c + half]
-        if c - half - 1 >= 0:
-            total -= values[c - half - 1]
-        out[c] = total
-
-
-@nb.njit(cache=True, nogil=True)
-def smoothed_at(image, r, c, box, top, scale, dark):  # type: ignore[no-untyped-def]
-    """What `smooth_row` would write at one place."""
-    rows, columns = image.shape
-    half = box // 2
-    total = np.int64(0)
-    for away in range(-2 * half, 2 * half + 1):
-        # Through the first box from column c + away, on to c through the second: boxes end at the border too.
-        if 0 <= c + away < columns:
-            ways = min(c + half, c + away + half, columns - 1) - max(c - half, c + away - half, 0) + 1
-            light = np.int64(0)
-            for q in (max(r - 1, 0), r, min(r + 1, rows - 1)):
-                light += grey(image[q, c + away], top, scale, dark)
-            total += ways * light
-    return total
-
-
-@nb.njit(cache=True, nogil=True)
-def level_and_spread(image, box, top, scale, dark, seen):  # type: ignore[no-untyped-def]
-    """(median, standard deviation) of the smoothed light at places all over the image.
-
-    The deviation comes from the steps between places two boxes apart, which share no pixel: the light of a lamp changes
-    little over that distance and is no noise.
-    """
-    rows, columns = image.shape
-    places = rows * columns
-    count = min(places, seen.size // 2)
-    for i in range(count):
-        place = (i * SPREAD_OF_PLACES) % places
-        r, c = place // columns, place % columns
-        here = smoothed_at(image, r, c, box, top, scale, dark)
-        seen[i] = here
-        seen[count + i] = abs(here - smoothed_at(image, r, (c + 2 * box) % columns, box, top, scale, dark))
-    level = np.partition(seen[:count], count // 2)[count // 2]
-    step = np.partition(seen[count : 2 * count], count // 2)[count // 2]
-    return level, STEP_TO_SIGMA * step
-
-
 @nb.njit(cache=True, nogil=True)
 def row_candidates(  # type: ignore[no-untyped-def]
-    row, smooth, level, spread, snr, faint, floor, from_row_mean, grain_px, reach, box, top, scale, dark, maxima, base,
-    shape, half, height, pedestal,
+    row, smooth, level, spread, snr, faint, floor, from_row_mean, grain_px, reach, box, top, scale, dark, lit, maxima,
+    base, shape, half, height, pedestal,
 ):  # fmt: skip
     """Candidates of one row, from low to high columns; return how many.
 
@@ -136,16 +47,13 @@ def row_candidates(  # type: ignore[no-untyped-def]
     columns = row.size
     limit = level + snr * spread
     least = np.int64(np.floor(limit)) + 1
+    mark_lit(smooth, least, lit)
     found = 0
     c = 0
     while c < columns:
-        if c % BLOCK == 0 and c + BLOCK <= columns:
-            most_of_block = smooth[c]
-            for i in range(c + 1, c + BLOCK):
-                most_of_block = max(most_of_block, smooth[i])
-            if most_of_block < least:
-                c += BLOCK
-                continue
+        if c % WORD == 0 and lit[c // WORD] == 0:
+            c += WORD
+            continue
         if smooth[c] < least:
             c += 1
             continue
@@ -176,8 +84,8 @@ def row_candidates(  # type: ignore[no-untyped-def]
     kept = 0
     foot = level + NOISE_AT_THE_FOOT * spread
     background = float(level)
-    if from_row_mean:
-        background = max(background, smooth.sum() / columns)
+    if from_row_mean and found > 0:
+        background = max(background, total_of(smooth) / columns)
     widened = BOX_WIDENS * (box * box - 1)
     for k in range(found):
         m = maxima[k]

@@ -264,14 +264,17 @@ def likeness(width: float, s: Setting) -> float:
     return max(0.0, 1 - abs(math.log(width / s.width)) / math.log(s.width_factor))
 
 
+def looked_at(rows: int) -> list[int]:
+    count = min(rows, 32)
+    return [(2 * i + 1) * rows // (2 * count) for i in range(count)]
+
+
+def upper_median(values: Array) -> float:
+    return float(np.sort(values, axis=None)[values.size // 2])
+
+
 def noise_of(image: Array) -> float:
-    rows, columns = image.shape
-    places = rows * (columns - 1)
-    at = [(i * 2654435761) % places for i in range(min(places, 1024))]
-    steps = sorted(
-        abs(image[p // (columns - 1), p % (columns - 1) + 1] - image[p // (columns - 1), p % (columns - 1)]) for p in at
-    )
-    return float(1.4826 / math.sqrt(2) * steps[len(steps) // 2])
+    return 1.4826 / math.sqrt(2) * upper_median(np.abs(np.diff(image[looked_at(len(image))], axis=1)))
 
 
 def without_smoothing(width: float, added: float) -> float:
@@ -279,26 +282,21 @@ def without_smoothing(width: float, added: float) -> float:
 
 
 def smoothed(image: Array, box: int) -> Array:
-    """Three rows summed (the border's row counts twice), two boxes across the columns, darkness outside."""
+    """Three rows summed (the border's row counts twice), by a triangle across the columns, darkness outside."""
     tall = np.pad(image, ((1, 1), (0, 0)), mode="edge")
-    sums = tall[:-2] + tall[1:-1] + tall[2:]
-    for _ in range(2):
-        wide = np.pad(sums, ((0, 0), (box // 2, box // 2)))
-        sums = np.sum([wide[:, i : i + image.shape[1]] for i in range(box)], axis=0)
-    return sums
+    sums = np.pad(tall[:-2] + tall[1:-1] + tall[2:], ((0, 0), (box - 1, box - 1)))
+    weights = [box - abs(away) for away in range(1 - box, box)]
+    return np.sum([w * sums[:, i : i + image.shape[1]] for i, w in enumerate(weights)], axis=0)
 
 
 def standing_out(image: Array, faint: float, s: Setting) -> list[list[Peak]]:
     box = 3 if s.width is None else min(15, max(3, 2 * math.floor(s.width / 2) + 1))
     added = 8 * math.log(2) * (box**2 - 1) / 6
     soft = smoothed(image, box)
-    places = soft.size
-    columns = image.shape[1]
-    at = [divmod((i * 2654435761) % places, columns) for i in range(min(places, 1024))]
-    seen = sorted(soft[r, c] for r, c in at)
-    level = seen[len(seen) // 2]
-    steps = sorted(abs(soft[r, c] - soft[r, (c + 2 * box) % columns]) for r, c in at)
-    spread = 1.4826 / math.sqrt(2) * steps[len(steps) // 2]
+    seen = soft[looked_at(len(soft))]
+    level = upper_median(seen)
+    apart = 2 * box % seen.shape[1]
+    spread = 1.4826 / math.sqrt(2) * upper_median(np.abs(seen - np.roll(seen, -apart, axis=1)))
     reach = math.ceil(2.2 * s.light_width)
     rows = []
     for P, S in zip(image, soft, strict=True):  # noqa: N806
