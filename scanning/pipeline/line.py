@@ -293,7 +293,7 @@ def find_line(counts, shape, height, expected, factor, gate_px, gate_max_px, bes
 
 
 @nb.njit(cache=True, nogil=True)
-def noise_of(image, top, scale):  # type: ignore[no-untyped-def]
+def noise_of(image, top, scale, linear, shift):  # type: ignore[no-untyped-def]
     """Noise of a pixel (standard deviation, in light): 1.4826 / sqrt 2 x the median step between neighbouring columns.
 
     The median over 1024 places spread over the image does not see the line, which covers a small part of it.
@@ -305,8 +305,11 @@ def noise_of(image, top, scale):  # type: ignore[no-untyped-def]
     for i in range(count):
         place = (i * SPREAD) % places
         r, c = place // (columns - 1), place % (columns - 1)
-        steps[i] = abs(min(np.int64(image[r, c + 1]), top) - min(np.int64(image[r, c]), top))
-    return NOISE_PER_STEP * np.partition(steps, count // 2)[count // 2] * scale
+        if linear.size > 0:
+            steps[i] = abs(linear[image[r, c + 1] >> shift] - linear[image[r, c] >> shift])
+        else:
+            steps[i] = abs(min(np.int64(image[r, c + 1]), top) - min(np.int64(image[r, c]), top)) * scale
+    return NOISE_PER_STEP * np.partition(steps, count // 2)[count // 2]
 
 
 @nb.njit(cache=True, nogil=True)
@@ -336,28 +339,40 @@ def candidates_by_threshold(  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def candidates_by_noise(  # type: ignore[no-untyped-def]
-    image, top, scale, dark, floor, from_row_mean, snr, faint, grain_px, reach, box, rows_of, seen, maxima,
-    base, shape, half, height, pedestal, counts,
+    image, top, scale, dark, linear, shift, floor, from_row_mean, snr, faint, grain_px, reach, box, rows_of, seen,
+    maxima, base, shape, half, height, pedestal, counts,
 ):  # fmt: skip
     """What stands out of the noise in every row; see standing_out.py."""
-    level, spread = level_and_spread(image, box, top, scale, dark, seen)
+    level, spread = level_and_spread(image, box, top, scale, dark, linear, shift, seen)
     rows = image.shape[0]
     three, once, smooth = rows_of[3], rows_of[4], rows_of[5]
-    light_of_row(image, 0, top, scale, dark, rows_of[0])
+    light_of_row(image, 0, top, scale, dark, linear, shift, rows_of[0])
     for r in range(rows):
         if r + 1 < rows:
-            light_of_row(image, r + 1, top, scale, dark, rows_of[(r + 1) % 3])
+            light_of_row(image, r + 1, top, scale, dark, linear, shift, rows_of[(r + 1) % 3])
         above, below = max(r - 1, 0) % 3, min(r + 1, rows - 1) % 3
         smooth_row(rows_of[above], rows_of[r % 3], rows_of[below], box, three, once, smooth)
         counts[r] = row_candidates(
-            image[r], smooth, level, spread, snr, faint, floor, from_row_mean, grain_px, reach, box, top, scale, dark,
-            maxima, base[r], shape[r], half[r], height[r], pedestal[r],
+            smooth, level, spread, snr, faint, floor, from_row_mean, grain_px, reach, box, rows_of[r % 3], maxima,
+            base[r], shape[r], half[r], height[r], pedestal[r],
         )  # fmt: skip
 
 
 @nb.njit(cache=True, nogil=True)
+def compressed(value, linear, shift):  # type: ignore[no-untyped-def]
+    """The grey value whose light this is: the inverse of ``linear``."""
+    entry = np.searchsorted(linear, value)
+    if entry == 0:
+        return 0.0
+    if entry >= linear.size:
+        return float((linear.size - 1) << shift)
+    share = (value - linear[entry - 1]) / (linear[entry] - linear[entry - 1])
+    return (entry - 1 + share + 0.5) * (1 << shift)
+
+
+@nb.njit(cache=True, nogil=True)
 def extract_line(  # type: ignore[no-untyped-def]
-    image, top, scale, dark, by_noise, by_path, k, floor, from_row_mean, ceiling, snr, grain_px, expected, factor,
+    image, top, scale, dark, linear, shift, by_noise, by_path, k, floor, from_row_mean, ceiling, snr, grain_px, expected, factor,
     gate_px, gate_max_px, best_seed, light_width, jump, reach, box,
     highest, light, base, shape, height, counts, chosen, rows_of, seen, maxima, half, pedestal, average, track, score,
     back, alive,
@@ -369,11 +384,11 @@ def extract_line(  # type: ignore[no-untyped-def]
     at half maximum, px). What lies between ``box`` and ``column_px`` is scratch that keeps its size.
     """
     rows = image.shape[0]
-    faint = snr * noise_of(image, top, scale) * STRICT if snr > 0.0 else 0.0
+    faint = snr * noise_of(image, top, scale, linear, shift) * STRICT if snr > 0.0 else 0.0
     if by_noise:
         candidates_by_noise(
-            image, top, scale, dark, floor, from_row_mean, snr, faint, grain_px, reach, box, rows_of, seen, maxima,
-            base, shape, half, height, pedestal, counts,
+            image, top, scale, dark, linear, shift, floor, from_row_mean, snr, faint, grain_px, reach, box, rows_of,
+            seen, maxima, base, shape, half, height, pedestal, counts,
         )  # fmt: skip
     else:
         candidates_by_threshold(
@@ -402,6 +417,10 @@ def extract_line(  # type: ignore[no-untyped-def]
         else:
             first, last = base[r, peak_of_row, 0], base[r, peak_of_row, 1]
             if by_noise:
+                if linear.size > 0:
+                    # The base ends at this light; the centre of gravity is that of what GLT made of it.
+                    pedestal[r, peak_of_row] = compressed(pedestal[r, peak_of_row], linear, shift)
+                    height[r, peak_of_row] = image[r, first : last + 1].max()
                 column_px[r] = centre_above(image[r], first, last, pedestal[r, peak_of_row], top, scale, dark)
             else:
                 column_px[r] = centre_of_gravity(image[r], first, last, top, scale, dark)

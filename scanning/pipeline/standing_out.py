@@ -12,9 +12,9 @@ candidates in 60 % of the rows beside a reflection). Noise is the same in every 
 3. Two maxima are grains of one line when they are ``grain_px`` or less apart, or when the valley between them is
    shallow (above 0.8 of the lower one).
 4. The base, over which the centre of gravity is taken, reaches on both sides to where the smoothed light falls to
-   ``floor`` of the candidate's own height (counted from the row's mean, so that a lamp does not stretch it) or into
-   the noise, to the valley before the next candidate, and no further
-   than ``reach`` columns. It is found in the smoothed light, so no single grain decides where it ends.
+   ``floor`` of the candidate's own height or into the noise, to the valley before the next candidate, and no further
+   than ``reach`` columns. The share counts from the row's mean, so that a lamp does not stretch the base; light above
+   the candidate's own is left out of that mean, or a bright reflection would lift it over a dim line. It is found in the smoothed light, so no single grain decides where it ends.
 
 Width is the full width at half maximum of the smoothed light, less what the smoothing added.
 """
@@ -48,11 +48,23 @@ def box_for(width_px: float | None) -> int:
     return min(WIDEST_BOX, max(3, 2 * int(width_px / 2.0) + 1))
 
 
+@nb.njit(cache=True, nogil=True, inline="always")
+def light(code, top, scale, dark, linear, shift):  # type: ignore[no-untyped-def]
+    """Light of one pixel; of one that GLT compressed, what it was before (``linear``, see `tone.light_table`)."""
+    if linear.size > 0:
+        return linear[code >> shift]
+    return grey(code, top, scale, dark)
+
+
 @nb.njit(cache=True, nogil=True)
-def light_of_row(image, r, top, scale, dark, out):  # type: ignore[no-untyped-def]
+def light_of_row(image, r, top, scale, dark, linear, shift, out):  # type: ignore[no-untyped-def]
     """The light of row r, int64."""
-    for c in range(image.shape[1]):
-        out[c] = grey(image[r, c], top, scale, dark)
+    if linear.size > 0:
+        for c in range(image.shape[1]):
+            out[c] = linear[image[r, c] >> shift]
+    else:
+        for c in range(image.shape[1]):
+            out[c] = grey(image[r, c], top, scale, dark)
 
 
 @nb.njit(cache=True, nogil=True)
@@ -86,7 +98,7 @@ def _box(values, box, out):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def smoothed_at(image, r, c, box, top, scale, dark):  # type: ignore[no-untyped-def]
+def smoothed_at(image, r, c, box, top, scale, dark, linear, shift):  # type: ignore[no-untyped-def]
     """What `smooth_row` would write at one place."""
     rows, columns = image.shape
     half = box // 2
@@ -95,15 +107,15 @@ def smoothed_at(image, r, c, box, top, scale, dark):  # type: ignore[no-untyped-
         # Through the first box from column c + away, on to c through the second: boxes end at the border too.
         if 0 <= c + away < columns:
             ways = min(c + half, c + away + half, columns - 1) - max(c - half, c + away - half, 0) + 1
-            light = np.int64(0)
+            three = np.int64(0)
             for q in (max(r - 1, 0), r, min(r + 1, rows - 1)):
-                light += grey(image[q, c + away], top, scale, dark)
-            total += ways * light
+                three += light(image[q, c + away], top, scale, dark, linear, shift)
+            total += ways * three
     return total
 
 
 @nb.njit(cache=True, nogil=True)
-def level_and_spread(image, box, top, scale, dark, seen):  # type: ignore[no-untyped-def]
+def level_and_spread(image, box, top, scale, dark, linear, shift, seen):  # type: ignore[no-untyped-def]
     """(median, standard deviation) of the smoothed light at places all over the image.
 
     The deviation comes from the steps between places two boxes apart, which share no pixel: the light of a lamp changes
@@ -115,25 +127,34 @@ def level_and_spread(image, box, top, scale, dark, seen):  # type: ignore[no-unt
     for i in range(count):
         place = (i * SPREAD_OF_PLACES) % places
         r, c = place // columns, place % columns
-        here = smoothed_at(image, r, c, box, top, scale, dark)
+        here = smoothed_at(image, r, c, box, top, scale, dark, linear, shift)
         seen[i] = here
-        seen[count + i] = abs(here - smoothed_at(image, r, (c + 2 * box) % columns, box, top, scale, dark))
+        seen[count + i] = abs(here - smoothed_at(image, r, (c + 2 * box) % columns, box, top, scale, dark, linear, shift))
     level = np.partition(seen[:count], count // 2)[count // 2]
     step = np.partition(seen[count : 2 * count], count // 2)[count // 2]
     return level, STEP_TO_SIGMA * step
 
 
 @nb.njit(cache=True, nogil=True)
+def _sum_up_to(values, most):  # type: ignore[no-untyped-def]
+    total = np.int64(0)
+    for c in range(values.size):
+        total += min(values[c], most)
+    return total
+
+
+@nb.njit(cache=True, nogil=True)
 def row_candidates(  # type: ignore[no-untyped-def]
-    row, smooth, level, spread, snr, faint, floor, from_row_mean, grain_px, reach, box, top, scale, dark, maxima, base,
-    shape, half, height, pedestal,
+    smooth, level, spread, snr, faint, floor, from_row_mean, grain_px, reach, box, own, maxima, base, shape,
+    half, height, pedestal,
 ):  # fmt: skip
     """Candidates of one row, from low to high columns; return how many.
 
     Written per candidate: base (first, last), shape (position, width) in px, half (from the maximum to
-    half height on the left, on the right; px, as smoothed), height and pedestal in light of the row itself.
+    half height on the left, on the right; px, as smoothed), height and pedestal in light of the row itself
+    (``own``).
     """
-    columns = row.size
+    columns = own.size
     limit = level + snr * spread
     least = np.int64(np.floor(limit)) + 1
     found = 0
@@ -175,13 +196,18 @@ def row_candidates(  # type: ignore[no-untyped-def]
         found += 1
     kept = 0
     foot = level + NOISE_AT_THE_FOOT * spread
-    background = float(level)
-    if from_row_mean:
-        background = max(background, smooth.sum() / columns)
+    brightest = 0
+    for k in range(found):
+        if smooth[maxima[k]] > smooth[maxima[brightest]]:
+            brightest = k
     widened = BOX_WIDENS * (box * box - 1)
     for k in range(found):
         m = maxima[k]
         tall = float(smooth[m] - level)
+        background = float(level)
+        if from_row_mean:
+            total = smooth.sum() if k == brightest else _sum_up_to(smooth, smooth[m])
+            background = max(background, total / columns)
         ends = max(foot, background + floor * (smooth[m] - background))
         middle_level = level + 0.5 * tall
         lowest, highest = max(0, m - reach), min(columns - 1, m + reach)
@@ -205,7 +231,7 @@ def row_candidates(  # type: ignore[no-untyped-def]
             last += 1
         most = np.int64(0)
         for i in range(first, last + 1):
-            most = max(most, grey(row[i], top, scale, dark))
+            most = max(most, own[i])
         if most <= faint:
             continue
         i = m

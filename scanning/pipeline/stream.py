@@ -27,7 +27,16 @@ from scanning.pipeline.grey import DARK_UNIT
 from scanning.pipeline.line import extract_line
 from scanning.pipeline.space_time import SpaceTime, px_per_step
 from scanning.pipeline.standing_out import PLACES, box_for
-from scanning.pipeline.tone import GREY_TOP, broadening, fixed_point, grey_bits, light_share, scaled_codes, tone
+from scanning.pipeline.tone import (
+    GREY_TOP,
+    broadening,
+    fixed_point,
+    grey_bits,
+    light_share,
+    light_table,
+    scaled_codes,
+    tone,
+)
 from scanning.range_image import RangeImage
 from scanning.recipe import Recipe
 from scanning.rig.protocols import Image
@@ -248,17 +257,19 @@ class ProfileStream:
             raw_k = 3.0 if h.response == "linear" else k
             seen = [images[e] for images in steps]
             width = estimate.line_width_px(seen, h.saturation, darks[e], raw_k, RAW_FLOOR, line.ceiling)
-        expected = line.width_px
-        if expected is None and width is not None:
-            expected = width * broadening(self.recipe.tone.p) if self.recipe.tone is not None else width
         wide = (line.width_px or width or 0.0) > WIDE_PX
         very_wide = (line.width_px or width or 0.0) > VERY_WIDE_PX
         candidates = line.candidates if line.candidates != "auto" else ("threshold" if wide else "noise")
+        # Candidates standing out of the noise are looked for in the light before GLT.
+        toned = self.recipe.tone if candidates == "threshold" else None
+        expected = line.width_px
+        if expected is None and width is not None:
+            expected = width * broadening(toned.p) if toned is not None else width
         floor = line.floor
         if floor is None:
             share = FOOT_FLOOR if candidates == "noise" else RAW_FLOOR
-            if self.recipe.tone is not None:
-                floor = light_share(share if candidates == "noise" else RAW_FLOOR / 2.0, self.recipe.tone.p)
+            if toned is not None:
+                floor = light_share(RAW_FLOOR / 2.0, toned.p)
             else:
                 floor = share if h.response == "linear" else LOGARITHMIC_FLOOR
         self.settled = Settled(
@@ -268,7 +279,9 @@ class ProfileStream:
             expected_width_px=expected,
             k=k,
             floor=floor,
-            snr=line.snr if line.snr is not None else (COMPRESSED_SNR if compressed else RAW_SNR),
+            snr=line.snr
+            if line.snr is not None
+            else (COMPRESSED_SNR if toned is not None or h.response == "logarithmic" else RAW_SNR),
             grain_px=line.grain_px
             if line.grain_px is not None
             else max(GRAIN_PX, (line.width_px or width or 0.0) / 4.0),
@@ -380,6 +393,9 @@ class _Chain:
         if self._tone_last:
             self._grey_level = float(1 << 20)
 
+        self._linear = np.zeros(0, np.int64), 0
+        if glt is not None and settled.candidates == "noise":
+            self._linear = light_table(round(GREY_TOP * self._grey_level), glt.p)
         width = settled.expected_width_px
         unit = line.width_px or settled.line_width_px or GRAIN_PX
         box = box_for(width)
@@ -427,7 +443,8 @@ class _Chain:
         peak = np.empty(self._rows)
         width_px = np.empty(self._rows)
         extract_line(
-            image, self._top, self._scale, self._dark, *self._line, highest, *self._scratch, column_px, peak, width_px
+            image, self._top, self._scale, self._dark, *self._linear, *self._line, highest, *self._scratch, column_px,
+            peak, width_px,
         )
         return column_px, (peak / self._grey_level).astype(np.float32), width_px.astype(np.float32)
 
