@@ -251,7 +251,8 @@ def row_candidates(  # type: ignore[no-untyped-def]
         shape[kept, 0] = 0.5 * (left + right)
         shape[kept, 1] = np.sqrt(max(width * width - widened, 0.0625 * width * width))
         half[kept, 0], half[kept, 1] = m - left, right - m
-        pedestal[kept] = ends / (3.0 * box * box)
+        # A row much darker than its neighbours keeps its line: the same share of its own light.
+        pedestal[kept] = min(ends / (3.0 * box * box), most * (ends / smooth[m]))
         height[kept] = most
         kept += 1
     return kept

@@ -352,7 +352,8 @@ def standing_out(image: Array, faint: float, s: Setting) -> list[list[Peak]]:
                 left = i - (S[i] - half) / (S[i] - S[i - 1])
             if j < S.size - 1 and S[j + 1] <= half:
                 right = j + (S[j] - half) / (S[j] - S[j + 1])
-            peaks.append(Peak(first, last, height, left, right, added, (top - left, right - top), ends / (3 * box**2)))
+            pedestal = min(ends / (3 * box**2), height * ends / S[top])
+            peaks.append(Peak(first, last, height, left, right, added, (top - left, right - top), pedestal))
         rows.append(peaks)
     return rows
 
