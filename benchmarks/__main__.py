@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import sys
 
-from benchmarks import damage, precision, speed
+from benchmarks import damage, ghosts, precision, speed
 
-QUESTIONS = {"precision": precision.main, "damage": damage.main, "speed": speed.main}
+QUESTIONS = {"precision": precision.main, "damage": damage.main, "ghosts": ghosts.main, "speed": speed.main}
 
 
 def main() -> int:

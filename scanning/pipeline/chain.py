@@ -15,7 +15,7 @@ from scanning.pipeline.grey import DARK_UNIT
 from scanning.pipeline.line import extract_line
 from scanning.pipeline.settle import GRAIN_PX, Settled
 from scanning.pipeline.smoothing import ROWS_LOOKED_AT, WORD, Rows, box_for, kind_for
-from scanning.pipeline.tone import GREY_TOP, fixed_point, grey_bits, scaled_codes, tone
+from scanning.pipeline.tone import GREY_TOP, fixed_point, grey_bits, light_table, scaled_codes, tone
 from scanning.recipe import Recipe
 from scanning.rig.protocols import Image
 
@@ -39,8 +39,7 @@ class Scratch:
 
     def __init__(self, rows: int, columns: int, box: int, kind: Any) -> None:
         most = columns // 2 + 1
-        of_one = Rows(columns, box, kind)
-        self._of_one = (of_one.three, of_one.once, of_one.smooth, of_one.looked_at)
+        self._of_three = Rows(columns, box, kind).arrays()
         self._of_row = (
             np.empty((most, 2), np.int64), np.empty((most, 2)), np.empty((most, 2)), np.empty(most, np.int64),
             np.empty(most),
@@ -72,7 +71,7 @@ class Scratch:
         """What `extract_line` wants, in its order."""
         of_rows = (self.base, self.shape, self.half, self.height, self.pedestal)
         return (
-            self._light, self._of_one, self._noise, self._maxima, self._lit, self._of_row, of_rows, self.counts,
+            self._light, self._of_three, self._noise, self._maxima, self._lit, self._of_row, of_rows, self.counts,
             self.chosen, self._of_path,
         )  # fmt: skip
 
@@ -146,7 +145,14 @@ class Chain:
             1.0 if width is None else width, np.inf if width is None else line.width_factor,
             line.gate_px, line.gate_max_px, line.seed == "best", unit, line.jump, math.ceil(REACH * unit), box,
         )  # fmt: skip
-        self._scratch = Scratch(rows, columns, box, kind_for(box, self._top, self._scale))
+        # The light before GLT, which candidates are looked for in.
+        self._linear: tuple[NDArray[np.uint32], int] = np.zeros(0, np.uint32), 0
+        kind = kind_for(box, self._top, self._scale)
+        if glt is not None and settled.candidates == "noise":
+            table, shift = light_table(self._top, glt.p)
+            self._linear = table.astype(np.uint32), shift
+            kind = kind_for(box, int(table[-1]), 1)
+        self._scratch = Scratch(rows, columns, box, kind)
         self._rows = rows
 
     def run(self, images: list[Image]) -> tuple[Float64, Float32, Float32] | None:
@@ -175,8 +181,8 @@ class Chain:
         highest = np.empty(self._rows, image.dtype)
         while True:
             most = extract_line(
-                image, self._top, self._scale, self._dark, *self._line, highest, *scratch.arrays(), column_px, peak,
-                width_px,
+                image, self._top, self._scale, self._dark, *self._linear, *self._line, highest, *scratch.arrays(),
+                column_px, peak, width_px,
             )  # fmt: skip
             if most <= scratch.most:
                 break

@@ -37,7 +37,7 @@ import numpy as np
 from scanning.pipeline.centroid import centre_above, centre_of_gravity
 from scanning.pipeline.grey import grey
 from scanning.pipeline.path import find_path
-from scanning.pipeline.smoothing import WORD, level_and_spread, mark_lit, noise_of, smooth_row
+from scanning.pipeline.smoothing import level_and_spread, light_of_row, mark_lit, next_lit, noise_of, smooth_row
 from scanning.pipeline.standing_out import BOX_WIDENS, row_candidates
 
 LINES_TRIED = 16
@@ -120,9 +120,9 @@ def row_peaks(row, lowest, faint, grain_px, top, scale, dark, lit, base, shape, 
     found = 0
     c = 0
     while c < columns:
-        if c % WORD == 0 and lit[c // WORD] == 0:
-            c += WORD
-            continue
+        c = next_lit(c, lit)
+        if c >= columns:
+            break
         if row[c] < lowest:
             c += 1
             continue
@@ -331,19 +331,24 @@ def candidates_by_threshold(  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def candidates_by_noise(  # type: ignore[no-untyped-def]
-    image, top, scale, dark, floor, from_row_mean, snr, faint, grain_px, reach, box, of_one, maxima, lit, of_row,
-    of_rows, counts,
+    image, top, scale, dark, linear, shift, floor, from_row_mean, snr, faint, grain_px, reach, box, of_three, maxima,
+    lit, of_row, of_rows, counts,
 ):  # fmt: skip
     """What stands out of the noise in every row; see standing_out.py. Returns the most in one row."""
-    three, once, smooth, looked_at = of_one
-    level, spread = level_and_spread(image, box, top, scale, dark, three, once, smooth, looked_at)
+    level, spread = level_and_spread(image, box, top, scale, dark, linear, shift, of_three)
+    light, three, once, smooth, _ = of_three
     base, shape, half, height, pedestal = of_row
     most = 0
-    for r in range(image.shape[0]):
-        smooth_row(image, r, box, top, scale, dark, three, once, smooth)
+    rows = image.shape[0]
+    light_of_row(image, 0, top, scale, dark, linear, shift, light[0])
+    for r in range(rows):
+        if r + 1 < rows:
+            light_of_row(image, r + 1, top, scale, dark, linear, shift, light[(r + 1) % 3])
+        above, own, below = light[max(r - 1, 0) % 3], light[r % 3], light[min(r + 1, rows - 1) % 3]
+        smooth_row(above, own, below, box, three, once, smooth)
         counts[r] = row_candidates(
-            image[r], smooth, level, spread, snr, faint, floor, from_row_mean, grain_px, reach, box, top, scale, dark,
-            lit, maxima, base, shape, half, height, pedestal,
+            smooth, level, spread, snr, faint, floor, from_row_mean, grain_px, reach, box, own, lit, maxima, base,
+            shape, half, height, pedestal,
         )  # fmt: skip
         keep(r, counts[r], of_row, of_rows)
         most = max(most, counts[r])
@@ -351,10 +356,22 @@ def candidates_by_noise(  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
+def compressed(value, linear, shift):  # type: ignore[no-untyped-def]
+    """The grey value whose light this is: the inverse of ``linear``."""
+    entry = np.searchsorted(linear, value)
+    if entry == 0:
+        return 0.0
+    if entry >= linear.size:
+        return float((linear.size - 1) << shift)
+    share = (value - linear[entry - 1]) / (linear[entry] - linear[entry - 1])
+    return (entry - 1 + share + 0.5) * (1 << shift)
+
+
+@nb.njit(cache=True, nogil=True)
 def extract_line(  # type: ignore[no-untyped-def]
-    image, top, scale, dark, by_noise, by_path, k, floor, from_row_mean, ceiling, snr, grain_px, expected, factor,
-    gate_px, gate_max_px, best_seed, light_width, jump, reach, box,
-    highest, light, of_one, noise, maxima, lit, of_row, of_rows, counts, chosen, of_path, column_px, peak, width_px,
+    image, top, scale, dark, linear, shift, by_noise, by_path, k, floor, from_row_mean, ceiling, snr, grain_px, expected,
+    factor, gate_px, gate_max_px, best_seed, light_width, jump, reach, box,
+    highest, light, of_three, noise, maxima, lit, of_row, of_rows, counts, chosen, of_path, column_px, peak, width_px,
 ):  # fmt: skip
     """MSNN then COG on one (rows, columns) image of integer codes (see `grey.grey` for top, scale, dark).
 
@@ -363,11 +380,11 @@ def extract_line(  # type: ignore[no-untyped-def]
     written. What lies between ``box`` and ``column_px`` is scratch that keeps its size; see `chain.Scratch`.
     """
     rows = image.shape[0]
-    faint = snr * noise_of(image, top, scale, noise) * STRICT if snr > 0.0 else 0.0
+    faint = snr * noise_of(image, top, scale, linear, shift, noise) * STRICT if snr > 0.0 else 0.0
     if by_noise:
         most = candidates_by_noise(
-            image, top, scale, dark, floor, from_row_mean, snr, faint, grain_px, reach, box, of_one, maxima, lit,
-            of_row, of_rows, counts,
+            image, top, scale, dark, linear, shift, floor, from_row_mean, snr, faint, grain_px, reach, box, of_three,
+            maxima, lit, of_row, of_rows, counts,
         )  # fmt: skip
     else:
         most = candidates_by_threshold(
@@ -395,6 +412,10 @@ def extract_line(  # type: ignore[no-untyped-def]
         else:
             first, last = base[r, peak_of_row, 0], base[r, peak_of_row, 1]
             if by_noise:
+                if linear.size > 0:
+                    # The base ends at this light; the centre of gravity is that of what GLT made of it.
+                    pedestal[r, peak_of_row] = compressed(pedestal[r, peak_of_row], linear, shift)
+                    height[r, peak_of_row] = image[r, first : last + 1].max()
                 column_px[r] = centre_above(image[r], first, last, pedestal[r, peak_of_row], top, scale, dark)
             else:
                 column_px[r] = centre_of_gravity(image[r], first, last, top, scale, dark)

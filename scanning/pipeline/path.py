@@ -41,6 +41,18 @@ LEAP_ROWS = 16
 """Rows within which the other side of a high step must be seen."""
 IN_COMMON = 2
 """Rows the two sides of a step may both be seen in: the lens blurs its brink."""
+LINES_TRIED = 48
+ROWS_LOOKED_AT = 64
+FEWEST_ROWS = 16
+LEAST_SHARE, FULL_SHARE = 0.4, 0.7
+TOUCHED = 0.3
+DARK_ROWS = 4
+ROWS_INSIDE = 7
+GLOW_ROWS = 32
+BORDER_ROWS = 8
+BRINK_ROWS = 2
+ASIDE = 0.5
+BONUS = 0.5
 BY_LIGHT = 0.1
 """This share of the reward depends on the light: of two equal paths the brighter one is the line."""
 BRIGHT = 0.25
@@ -121,6 +133,113 @@ def cost(moved, rows_on, is_step, width, jump, gate):  # type: ignore[no-untyped
 
 
 @nb.njit(cache=True, nogil=True)
+def judge(  # type: ignore[no-untyped-def]
+    counts, shape, height, average, widened, expected, factor, bright, width, carrier, agreeing, earned
+):
+    """Write what every candidate earns when it is taken, 0 for one that never is."""
+    judged = np.isfinite(factor)
+    for r in range(counts.size):
+        for k in range(counts[r]):
+            alike = 1.0
+            if judged:
+                alike = likeness(average[r, k], widened, expected, factor)
+            near = 0.0
+            if agreeing > 0.0:
+                off = abs(shape[r, k, 0] - carrier[0] - carrier[1] * r) / width
+                near = max(0.0, min(1.0, 2.0 - off))
+                if height[r, k] >= bright:
+                    alike = max(alike, TOUCHED * near)
+                alike *= 1.0 - agreeing * ASIDE * (1.0 - near)
+            if alike > TIE:
+                alike *= 1.0 - BY_LIGHT + BY_LIGHT * min(1.0, height[r, k] / bright)
+                alike += agreeing * BONUS * near
+            earned[r, k] = alike
+
+
+@nb.njit(cache=True, nogil=True)
+def find_carrier(counts, shape, earned, chosen, width, carrier):  # type: ignore[no-untyped-def]
+    """Write the straight line (column at row 0, columns per row) that most rows have a candidate on.
+
+    Return the share of the rows with a candidate that do. Lines through two rows of the path are tried.
+    """
+    rows = counts.size
+    on_path = 0
+    seen = 0
+    for r in range(rows):
+        if chosen[r] >= 0:
+            on_path += 1
+        if counts[r] > 0:
+            seen += 1
+    if on_path < FEWEST_ROWS:
+        return 0.0
+    at = np.empty(on_path, np.int64)
+    n = 0
+    for r in range(rows):
+        if chosen[r] >= 0:
+            at[n] = r
+            n += 1
+    every = max(1, rows // ROWS_LOOKED_AT)
+    most, column, slope = -1, 0.0, 0.0
+    for i in range(LINES_TRIED):
+        first = at[(i * n) // LINES_TRIED]
+        second = at[((i * n) // LINES_TRIED + n // 4 + ((i * 7) % LINES_TRIED) * n // (2 * LINES_TRIED)) % n]
+        if abs(second - first) < rows // 8 or first == second:
+            continue
+        here, there = shape[first, chosen[first], 0], shape[second, chosen[second], 0]
+        per_row = (there - here) / (second - first)
+        start = here - per_row * first
+        agree = 0
+        for r in range(0, rows, every):
+            for k in range(counts[r]):
+                if earned[r, k] > TIE and abs(shape[r, k, 0] - start - per_row * r) <= width + TIE:
+                    agree += 1
+                    break
+        if agree > most:
+            most, column, slope = agree, start, per_row
+    if most < 0:
+        return 0.0
+    for _ in range(2):
+        count, sum_r, sum_c, sum_rr, sum_rc = 0, 0.0, 0.0, 0.0, 0.0
+        for r in range(rows):
+            nearest, off = -1, width + 2.0 * TIE
+            for k in range(counts[r]):
+                away = abs(shape[r, k, 0] - column - slope * r)
+                if earned[r, k] > TIE and away < off - TIE:
+                    nearest, off = k, away
+            if nearest >= 0:
+                c = shape[r, nearest, 0]
+                count += 1
+                sum_r += r
+                sum_c += c
+                sum_rr += r * r
+                sum_rc += r * c
+        spread = count * sum_rr - sum_r * sum_r
+        if count < FEWEST_ROWS or spread <= 0.0:
+            return 0.0
+        slope = (count * sum_rc - sum_r * sum_c) / spread
+        column = (sum_c - slope * sum_r) / count
+    carrier[0], carrier[1] = column, slope
+    return count / seen
+
+
+@nb.njit(cache=True, nogil=True)
+def width_on(counts, shape, earned, average, carrier, width, widened, expected):  # type: ignore[no-untyped-def]
+    """Median width (px, as the image shows it without smoothing) of the candidates on the carrier."""
+    widths = np.empty(counts.size)
+    n = 0
+    for r in range(counts.size):
+        for k in range(counts[r]):
+            if earned[r, k] > TIE and abs(shape[r, k, 0] - carrier[0] - carrier[1] * r) <= width + TIE:
+                a = average[r, k]
+                whole = 0.5 * (a[0, 0] + a[0, 1] + a[1, 0] + a[1, 1])
+                widths[n] = np.sqrt(max(whole * whole - widened, 0.0625 * whole * whole))
+                n += 1
+    if n == 0:
+        return expected
+    return np.partition(widths[:n], n // 2)[n // 2]
+
+
+@nb.njit(cache=True, nogil=True)
 def find_path(  # type: ignore[no-untyped-def]
     counts, shape, half, height, widened, expected, factor, width, jump, gate, average, track, score, back_row,
     back_peak, alive, chosen,
@@ -130,29 +249,85 @@ def find_path(  # type: ignore[no-untyped-def]
     ``expected`` width (px) as the image shows it and the factor it may be off (inf: any); ``width`` of the light, the
     unit of moving. ``average, track, score, back_row, back_peak, alive`` are scratch.
     """
-    rows = counts.size
-    chosen[:] = -1
-    judged = np.isfinite(factor)
     average_halves(counts, shape, half, width, average, track)
     bright = BRIGHT * mean_of_highest(counts, height)
+    carrier = np.zeros(2)
+    earned = np.zeros_like(score)
+    judge(counts, shape, height, average, widened, expected, factor, bright, width, carrier, 0.0, earned)
+    best_path(counts, shape, earned, width, jump, gate, track, score, back_row, back_peak, alive, chosen)
+    share = find_carrier(counts, shape, earned, chosen, width, carrier)
+    if share < LEAST_SHARE:
+        leave_glow_out(height, chosen)
+        return
+    if np.isfinite(factor):
+        expected = min(1.6 * expected, max(expected, width_on(counts, shape, earned, average, carrier, width, widened, expected)))
+    agreeing = min(1.0, (share - LEAST_SHARE) / (FULL_SHARE - LEAST_SHARE))
+    judge(counts, shape, height, average, widened, expected, factor, bright, width, carrier, agreeing, earned)
+    best_path(counts, shape, earned, width, jump, gate, track, score, back_row, back_peak, alive, chosen)
+    leave_glow_out(height, chosen)
+
+
+@nb.njit(cache=True, nogil=True)
+def leave_glow_out(height, chosen):  # type: ignore[no-untyped-def]
+    """Where the line ends at darkness, take the rows away that only the lens lights.
+
+    The image of a brink has half the light of the surface there; beyond it a lens spreads the light of an edge as
+    1 / distance (simulated at f/4 to f/8: 0.05 to 0.2 over the rows between, 9 of 10 rows below 0.25).
+    """
+    rows = chosen.size
+    inside = np.empty(ROWS_INSIDE, np.int64)
+    for way in (1, -1):
+        dark = DARK_ROWS
+        nearest = BORDER_ROWS  # the frame's border may cut the line, and a single row of speckle is dark
+        for i in range(rows):
+            r = i if way == 1 else rows - 1 - i
+            if chosen[r] >= 0 and (dark < DARK_ROWS or not is_glow(height, chosen, r, way, nearest, inside)):
+                dark = 0
+            else:
+                chosen[r] = -1
+                dark += 1
+                nearest = 1
+
+
+@nb.njit(cache=True, nogil=True)
+def is_glow(height, chosen, r, way, nearest, inside):  # type: ignore[no-untyped-def]
+    """Whether the rows further on (``way``) outshine row r so much that its light is theirs."""
+    rows = chosen.size
+    for d in range(nearest, GLOW_ROWS + 1):
+        n = 0
+        for on in range(d, d + ROWS_INSIDE):
+            q = r + way * on
+            if 0 <= q < rows and chosen[q] >= 0:
+                inside[n] = height[q, chosen[q]]
+                n += 1
+        times = 2 * d if d <= BRINK_ROWS else 4 * d
+        if n > ROWS_INSIDE // 2 and times * height[r, chosen[r]] < np.partition(inside[:n], n // 2)[n // 2]:
+            return True
+    return False
+
+
+@nb.njit(cache=True, nogil=True)
+def best_path(  # type: ignore[no-untyped-def]
+    counts, shape, earned, width, jump, gate, track, score, back_row, back_peak, alive, chosen
+):
+    """Choose the candidates on the path of the most earnings less costs, -1 where there is none."""
+    rows = counts.size
+    chosen[:] = -1
     best, end_row, end_peak = 0.0, -1, -1
     living = 0
     for r in range(rows):
         fresh = living
         for k in range(counts[r]):
-            earned = 1.0
-            if judged:
-                earned = likeness(average[r, k], widened, expected, factor)
-            if earned <= TIE:
+            own = earned[r, k]
+            if own <= TIE:
                 continue
-            earned *= 1.0 - BY_LIGHT + BY_LIGHT * min(1.0, height[r, k] / bright)
-            value, from_row, from_peak = earned, -1, -1
+            value, from_row, from_peak = own, -1, -1
             for s in range(living - 1, -1, -1):  # the latest first: it wins a tie
                 q, p = alive[s, 0], alive[s, 1]
                 moved = abs(shape[r, k, 0] - shape[q, p, 0])
                 starts, ends = track[r, k, 0] >= q - IN_COMMON, track[q, p, 1] <= r + IN_COMMON
                 is_step = starts and ends and r - q <= LEAP_ROWS
-                through = score[q, p] + earned - cost(moved, r - q, is_step, width, jump, gate)
+                through = score[q, p] + own - cost(moved, r - q, is_step, width, jump, gate)
                 if through > value + TIE:
                     value, from_row, from_peak = through, q, p
             score[r, k] = value

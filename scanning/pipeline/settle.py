@@ -88,19 +88,22 @@ def settle(recipe: Recipe, header: StackHeader, steps: list[list[Image]]) -> tup
         raw_k = 3.0 if h.response == "linear" else k
         seen = [images[e] for images in steps]
         width = estimate.line_width_px(seen, h.saturation, darks[e], raw_k, RAW_FLOOR, line.ceiling)
-    expected = line.width_px
-    if expected is None and width is not None:
-        expected = width * broadening(recipe.tone.p) if recipe.tone is not None else width
     wide = (line.width_px or width or 0.0) > WIDE_PX
     very_wide = (line.width_px or width or 0.0) > VERY_WIDE_PX
     candidates = line.candidates if line.candidates != "auto" else ("threshold" if wide else "noise")
+    # Candidates standing out of the noise are looked for in the light before GLT.
+    toned = recipe.tone if candidates == "threshold" else None
+    expected = line.width_px
+    if expected is None and width is not None:
+        expected = width * broadening(toned.p) if toned is not None else width
     floor = line.floor
     if floor is None:
         share = FOOT_FLOOR if candidates == "noise" else RAW_FLOOR
-        if recipe.tone is not None:
-            floor = light_share(share if candidates == "noise" else RAW_FLOOR / 2.0, recipe.tone.p)
+        if toned is not None:
+            floor = light_share(RAW_FLOOR / 2.0, toned.p)
         else:
             floor = share if h.response == "linear" else LOGARITHMIC_FLOOR
+    default_snr = COMPRESSED_SNR if toned is not None or h.response == "logarithmic" else RAW_SNR
     settled = Settled(
         exposures_us=tuple(h.exposures_us[e] for e in selected),
         dark_levels=tuple(darks[e] for e in selected),
@@ -108,7 +111,7 @@ def settle(recipe: Recipe, header: StackHeader, steps: list[list[Image]]) -> tup
         expected_width_px=expected,
         k=k,
         floor=floor,
-        snr=line.snr if line.snr is not None else (COMPRESSED_SNR if compressed else RAW_SNR),
+        snr=line.snr if line.snr is not None else default_snr,
         grain_px=line.grain_px if line.grain_px is not None else max(GRAIN_PX, (line.width_px or width or 0.0) / 4.0),
         candidates=candidates,
         continuity=line.continuity if line.continuity != "auto" else ("nearest" if very_wide else "path"),

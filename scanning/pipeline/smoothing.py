@@ -21,15 +21,13 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from scanning.pipeline.grey import grey
-
 ROWS_LOOKED_AT = 32
 """Rows that level, spread and noise come from; the line covers a small part of each, so medians do not see it."""
 STEP_TO_SIGMA = 1.4826 / np.sqrt(2.0)
 WIDEST_BOX = 15
 """Grains and noise are a few pixels wide, however wide the line."""
 WORD = 8
-"""Columns looked at together once they are marked."""
+"""Columns looked at together once they are marked: as many as bytes in a word."""
 
 
 def box_for(width_px: float | None) -> int:
@@ -46,34 +44,47 @@ def kind_for(box: int, top: int, scale: int) -> Any:
 
 
 class Rows:
-    """Scratch for one row: ``three`` rows' sum and ``once`` boxed, with darkness on both sides; ``smooth``; ``lit``."""
+    """Scratch: ``light`` of three rows; their sum ``three`` and ``once`` boxed, with darkness on both sides; ``smooth``.
+
+    ``looked_at`` has room for the rows that level and spread come from, and for the steps in them.
+    """
 
     def __init__(self, columns: int, box: int, kind: Any) -> None:
         around = 2 * (box // 2)
-        words = -(-columns // WORD)
+        self.light: NDArray[Any] = np.zeros((3, columns), kind)
         self.three: NDArray[Any] = np.zeros(columns + 2 * around, kind)
         self.once: NDArray[Any] = np.zeros(columns + around, kind)
         self.smooth: NDArray[Any] = np.zeros(columns, kind)
-        self.lit: NDArray[np.uint64] = np.zeros(words, np.uint64)
         self.looked_at: NDArray[Any] = np.zeros((2, ROWS_LOOKED_AT * columns), kind)
+
+    def arrays(self) -> tuple[NDArray[Any], ...]:
+        return self.light, self.three, self.once, self.smooth, self.looked_at
 
 
 @nb.njit(cache=True, nogil=True)
-def smooth_row(image, r, box, top, scale, dark, three, once, smooth):  # type: ignore[no-untyped-def]
-    """Write the smoothed light of row r; see `Rows` for the scratch."""
-    rows, columns = image.shape
+def light_of_row(image, r, top, scale, dark, linear, shift, out):  # type: ignore[no-untyped-def]
+    """The light of row r; of pixels that GLT compressed what it was before (``linear``, see `tone.light_table`)."""
+    row = image[r]
+    if linear.size > 0:
+        for c in range(out.size):
+            out[c] = linear[row[c] >> shift]
+    else:
+        kind = out.dtype.type
+        highest, unit, nothing = kind(top), kind(scale), kind(dark)
+        for c in range(out.size):
+            code = kind(min(kind(row[c]), highest) * unit)
+            out[c] = kind(max(code, nothing) - nothing)
+
+
+@nb.njit(cache=True, nogil=True)
+def smooth_row(above, own, below, box, three, once, smooth):  # type: ignore[no-untyped-def]
+    """Write the smoothed light of a row from the light of three; see `Rows` for the scratch."""
     kind = smooth.dtype.type
-    highest, unit, nothing = kind(top), kind(scale), kind(dark)
-    above, own, below = image[max(r - 1, 0)], image[r], image[min(r + 1, rows - 1)]
-    inner = three[2 * (box // 2) :]
-    for c in range(columns):
-        a = kind(min(kind(above[c]), highest) * unit)
-        b = kind(min(kind(own[c]), highest) * unit)
-        d = kind(min(kind(below[c]), highest) * unit)
-        light = kind(max(a, nothing) - nothing) + kind(max(b, nothing) - nothing) + kind(max(d, nothing) - nothing)
-        inner[c] = kind(light)
+    inner = three[box - 1 :]
+    for c in range(own.size):
+        inner[c] = kind(above[c] + own[c] + below[c])
     if box == 3:
-        for c in range(columns):
+        for c in range(smooth.size):
             smooth[c] = kind(three[c] + three[c + 4] + 2 * (three[c + 1] + three[c + 3]) + 3 * three[c + 2])
     else:
         _box(three, box, once)
@@ -104,9 +115,27 @@ def _box(values, box, out):  # type: ignore[no-untyped-def]
 @nb.njit(cache=True, nogil=True)
 def mark_lit(values, least, lit):  # type: ignore[no-untyped-def]
     """Set byte c of ``lit`` (uint64 words) to 1 where values[c] >= least, else to 0."""
+    limit = values.dtype.type(least)
+    if np.int64(limit) != np.int64(least):  # above all that these integers can hold
+        lit[:] = 0
+        return
     marks = lit.view(np.uint8)
     for c in range(values.size):
-        marks[c] = np.uint8(values[c] >= least)
+        marks[c] = np.uint8(values[c] >= limit)
+
+
+@nb.njit(cache=True, nogil=True, inline="always")
+def next_lit(c, lit):  # type: ignore[no-untyped-def]
+    """The column to go on at: c, or where c begins a word without light the beginning of the next word that has some.
+
+    May lie behind the last column.
+    """
+    if c & 7 == 0:
+        word = c >> 3
+        while word < lit.size and lit[word] == 0:
+            word += 1
+        return max(c, word << 3)
+    return c
 
 
 @nb.njit(cache=True, nogil=True)
@@ -139,18 +168,22 @@ def looked_at_row(i, rows):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def level_and_spread(image, box, top, scale, dark, three, once, smooth, looked_at):  # type: ignore[no-untyped-def]
+def level_and_spread(image, box, top, scale, dark, linear, shift, of_three):  # type: ignore[no-untyped-def]
     """(median, standard deviation) of the smoothed light of rows all over the image.
 
     The deviation comes from the steps between places two boxes apart, which share no pixel: the light of a lamp changes
     little over that distance and is no noise. Behind the last column it goes on at the first.
     """
+    light, three, once, smooth, looked_at = of_three
     rows, columns = image.shape
     apart = (2 * box) % columns
     count = min(rows, ROWS_LOOKED_AT)
     highest = np.int64(0)
     for i in range(count):
-        smooth_row(image, looked_at_row(i, rows), box, top, scale, dark, three, once, smooth)
+        r = looked_at_row(i, rows)
+        for away in range(-1, 2):
+            light_of_row(image, min(max(r + away, 0), rows - 1), top, scale, dark, linear, shift, light[away + 1])
+        smooth_row(light[0], light[1], light[2], box, three, once, smooth)
         seen, steps = looked_at[0, i * columns : (i + 1) * columns], looked_at[1, i * columns : (i + 1) * columns]
         most = smooth[0]
         for c in range(columns):
@@ -172,11 +205,11 @@ def _steps(here, there, out):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def noise_of(image, top, scale, looked_at):  # type: ignore[no-untyped-def]
+def noise_of(image, top, scale, linear, shift, looked_at):  # type: ignore[no-untyped-def]
     """Noise of a pixel (standard deviation, in light): 1.4826 / sqrt 2 x the median step between neighbouring columns.
 
     The median over rows spread over the image does not see the line, which covers a small part of it. ``looked_at`` is
-    int64 scratch of ROWS_LOOKED_AT x (columns - 1).
+    int64 scratch of ROWS_LOOKED_AT x columns.
     """
     rows, columns = image.shape
     count = min(rows, ROWS_LOOKED_AT)
@@ -184,10 +217,15 @@ def noise_of(image, top, scale, looked_at):  # type: ignore[no-untyped-def]
     for i in range(count):
         row = image[looked_at_row(i, rows)]
         steps = looked_at[i * (columns - 1) : (i + 1) * (columns - 1)]
+        if linear.size > 0:
+            for c in range(columns - 1):
+                steps[c] = abs(np.int64(linear[row[c + 1] >> shift]) - np.int64(linear[row[c] >> shift]))
+        else:
+            for c in range(columns - 1):
+                steps[c] = abs(min(np.int64(row[c + 1]), top) - min(np.int64(row[c]), top)) * scale
         for c in range(columns - 1):
-            steps[c] = abs(min(np.int64(row[c + 1]), top) - min(np.int64(row[c]), top))
             highest = max(highest, steps[c])
-    return STEP_TO_SIGMA * median(looked_at[: count * (columns - 1)], highest) * scale
+    return STEP_TO_SIGMA * median(looked_at[: count * (columns - 1)], highest)
 
 
 @nb.njit(cache=True, nogil=True)
@@ -200,7 +238,18 @@ def total_of(values):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def light_of_row(image, r, top, scale, dark, out):  # type: ignore[no-untyped-def]
-    """The light of row r, int64."""
-    for c in range(image.shape[1]):
-        out[c] = grey(image[r, c], top, scale, dark)
+def sum_up_to(values, most):  # type: ignore[no-untyped-def]
+    """The same with every value cut at ``most``."""
+    total = np.int64(0)
+    for c in range(values.size):
+        total += np.int64(min(values[c], most))
+    return total
+
+
+@nb.njit(cache=True, nogil=True)
+def lowest_of(values):  # type: ignore[no-untyped-def]
+    """The lowest of at least one value."""
+    least = values[0]
+    for c in range(values.size):
+        least = min(least, values[c])
+    return least

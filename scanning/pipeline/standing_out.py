@@ -11,9 +11,10 @@ candidates in 60 % of the rows beside a reflection). Noise is the same in every 
 3. Two maxima are grains of one line when they are ``grain_px`` or less apart, or when the valley between them is
    shallow (above 0.8 of the lower one).
 4. The base, over which the centre of gravity is taken, reaches on both sides to where the smoothed light falls to
-   ``floor`` of the candidate's own height (counted from the row's mean, so that a lamp does not stretch it) or into
-   the noise, to the valley before the next candidate, and no further
-   than ``reach`` columns. It is found in the smoothed light, so no single grain decides where it ends.
+   ``floor`` of the candidate's own height or into the noise, to the valley before the next candidate, and no further
+   than ``reach`` columns. The share counts from the row's mean, so that a lamp does not stretch the base; light above
+   the candidate's own is left out of that mean, or a bright reflection would lift it over a dim line. It is found in the smoothed
+   light, so no single grain decides where it ends.
 
 Width is the full width at half maximum of the smoothed light, less what the smoothing added.
 """
@@ -23,8 +24,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from scanning.pipeline.grey import grey
-from scanning.pipeline.smoothing import WORD, mark_lit, total_of
+from scanning.pipeline.smoothing import lowest_of, mark_lit, next_lit, sum_up_to, total_of
 
 SHALLOW = 0.8
 """A valley above this share of the lower of its two maxima does not part them."""
@@ -36,24 +36,25 @@ BOX_WIDENS = 2.0 * np.log(2.0) * 4.0 / 6.0
 
 @nb.njit(cache=True, nogil=True)
 def row_candidates(  # type: ignore[no-untyped-def]
-    row, smooth, level, spread, snr, faint, floor, from_row_mean, grain_px, reach, box, top, scale, dark, lit, maxima,
-    base, shape, half, height, pedestal,
+    smooth, level, spread, snr, faint, floor, from_row_mean, grain_px, reach, box, own, lit, maxima, base, shape,
+    half, height, pedestal,
 ):  # fmt: skip
     """Candidates of one row, from low to high columns; return how many.
 
     Written per candidate: base (first, last), shape (position, width) in px, half (from the maximum to
-    half height on the left, on the right; px, as smoothed), height and pedestal in light of the row itself.
+    half height on the left, on the right; px, as smoothed), height and pedestal in light of the row itself
+    (``own``).
     """
-    columns = row.size
+    columns = own.size
     limit = level + snr * spread
     least = np.int64(np.floor(limit)) + 1
     mark_lit(smooth, least, lit)
     found = 0
     c = 0
     while c < columns:
-        if c % WORD == 0 and lit[c // WORD] == 0:
-            c += WORD
-            continue
+        c = next_lit(c, lit)
+        if c >= columns:
+            break
         if smooth[c] < least:
             c += 1
             continue
@@ -71,9 +72,7 @@ def row_candidates(  # type: ignore[no-untyped-def]
         c += 1
         if found > 0:
             before = maxima[found - 1]
-            valley = smooth[before]
-            for i in range(before + 1, middle):
-                valley = min(valley, smooth[i])
+            valley = lowest_of(smooth[before:middle])
             lower = min(smooth[before], smooth[middle])
             if middle - before <= grain_px or valley - level > SHALLOW * (lower - level):
                 if smooth[middle] > smooth[before]:
@@ -83,27 +82,33 @@ def row_candidates(  # type: ignore[no-untyped-def]
         found += 1
     kept = 0
     foot = level + NOISE_AT_THE_FOOT * spread
-    background = float(level)
-    if from_row_mean and found > 0:
-        background = max(background, total_of(smooth) / columns)
+    brightest = 0
+    for k in range(found):
+        if smooth[maxima[k]] > smooth[maxima[brightest]]:
+            brightest = k
     widened = BOX_WIDENS * (box * box - 1)
     for k in range(found):
         m = maxima[k]
         tall = float(smooth[m] - level)
+        background = float(level)
+        if from_row_mean:
+            total = total_of(smooth) if k == brightest else sum_up_to(smooth, smooth[m])
+            background = max(background, total / columns)
         ends = max(foot, background + floor * (smooth[m] - background))
         middle_level = level + 0.5 * tall
         lowest, highest = max(0, m - reach), min(columns - 1, m + reach)
         if k > 0:
+            # The valley nearest to the maximum; where it is beyond the reach it does not matter.
+            valley_level = lowest_of(smooth[maxima[k - 1] + 1 : m + 1])
             valley = m
-            for i in range(m - 1, maxima[k - 1], -1):
-                if smooth[i] < smooth[valley]:
-                    valley = i
+            while valley > lowest and smooth[valley] != valley_level:
+                valley -= 1
             lowest = max(lowest, valley)
         if k + 1 < found:
+            valley_level = lowest_of(smooth[m : maxima[k + 1]])
             valley = m
-            for i in range(m + 1, maxima[k + 1]):
-                if smooth[i] < smooth[valley]:
-                    valley = i
+            while valley < highest and smooth[valley] != valley_level:
+                valley += 1
             highest = min(highest, valley)
         first = m
         while first > lowest and smooth[first - 1] > ends:
@@ -113,7 +118,7 @@ def row_candidates(  # type: ignore[no-untyped-def]
             last += 1
         most = np.int64(0)
         for i in range(first, last + 1):
-            most = max(most, grey(row[i], top, scale, dark))
+            most = max(most, np.int64(own[i]))
         if most <= faint:
             continue
         i = m
@@ -133,7 +138,8 @@ def row_candidates(  # type: ignore[no-untyped-def]
         shape[kept, 0] = 0.5 * (left + right)
         shape[kept, 1] = np.sqrt(max(width * width - widened, 0.0625 * width * width))
         half[kept, 0], half[kept, 1] = m - left, right - m
-        pedestal[kept] = ends / (3.0 * box * box)
+        # A row much darker than its neighbours keeps its line: the same share of its own light.
+        pedestal[kept] = min(ends / (3.0 * box * box), most * (ends / smooth[m]))
         height[kept] = most
         kept += 1
     return kept

@@ -17,6 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 GREY_TOP = 255.0
+LIGHT_BITS = 13
+"""Grey values after GLT are told apart to this many binary digits where their light is looked up."""
+LIGHT_UNIT = 1 << 12
 Float = NDArray[np.float64]
 
 
@@ -34,6 +37,20 @@ def grey_bits(window: int) -> int:
 def fixed_point(grey: Float, bits: int) -> NDArray[np.int32]:
     """Grey values as whole multiples of 2^-bits, int32."""
     return np.rint(grey * float(1 << bits)).astype(np.int32)
+
+
+def light_table(top: int, p: float) -> tuple[NDArray[np.int64], int]:
+    """What the whole numbers 0 .. ``top`` that stand for grey values 0 .. 255 after GLT were before it.
+
+    Returns the table, in 1/4096 grey level, and the shift: entry ``value >> shift``. GLT makes a reflection look like
+    the line and joins the two where they touch, so the line is looked for in the light, and only measured after GLT.
+    """
+    shift = max(0, int(top).bit_length() - LIGHT_BITS)
+    middle = (np.arange((top >> shift) + 1) + 0.5) * float(1 << shift) / top * GREY_TOP
+    light = (GREY_TOP + 1.0) ** ((np.minimum(middle, GREY_TOP) / GREY_TOP) ** (1.0 / p)) - 1.0
+    table = np.rint(light * LIGHT_UNIT).astype(np.int64)
+    table[0] = 0
+    return table, shift
 
 
 def scaled_codes(codes: Float, dark_level: float, saturation: int) -> Float:

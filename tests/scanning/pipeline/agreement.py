@@ -55,15 +55,15 @@ def reference(steps: Steps, header: StackHeader, recipe: Recipe) -> NDArray[np.f
     line, sci, hdre, glt = recipe.line, recipe.compound, recipe.hdre, recipe.tone
     assert header.dark_level is not None
     compressed = glt is not None or header.response == "logarithmic"
-    width = line.width_px
-    if width is None and header.line_width_px is not None:
-        width = header.line_width_px * (broadening(glt.p) if glt is not None else 1.0)
     light_width = line.width_px or header.line_width_px or 3.0
     candidates = line.candidates if line.candidates != "auto" else ("threshold" if light_width > 12 else "noise")
+    toned = glt is not None and candidates == "threshold"
+    width = line.width_px
+    if width is None and header.line_width_px is not None:
+        width = header.line_width_px * (broadening(glt.p) if glt is not None and toned else 1.0)
     floor = line.floor
-    if floor is None and glt is not None:
-        share = 0.02 if candidates == "noise" else 0.05
-        floor = (math.log(share * 64 + 1) / math.log(65)) ** glt.p
+    if floor is None and glt is not None and toned:
+        floor = (math.log(0.05 * 64 + 1) / math.log(65)) ** glt.p
     elif floor is None:
         floor = 0.6 if header.response == "logarithmic" else (0.02 if candidates == "noise" else 0.1)
     setting = Setting(
@@ -79,7 +79,7 @@ def reference(steps: Steps, header: StackHeader, recipe: Recipe) -> NDArray[np.f
         floor=floor,
         floor_from_row_mean=line.floor_from == "row_mean",
         ceiling=line.ceiling,
-        snr=line.snr if line.snr is not None else (3.0 if compressed else 4.0),
+        snr=line.snr if line.snr is not None else (3.0 if toned or header.response == "logarithmic" else 4.0),
         grain=line.grain_px
         if line.grain_px is not None
         else max(3.0, (line.width_px or header.line_width_px or 0.0) / 4),

@@ -50,10 +50,15 @@ class Setting:
     light_width: float = 3.0  # px, before GLT; 3 where nobody knows
 
 
-def quantised(grey: Array, window: int) -> Array:
+def grey_bits(window: int) -> int:
     bits = 20
     while 255 * 2**bits * window >= 2**31:
         bits -= 1
+    return bits
+
+
+def quantised(grey: Array, window: int) -> Array:
+    bits = grey_bits(window)
     return np.rint(grey * 2.0**bits) / 2.0**bits
 
 
@@ -317,7 +322,7 @@ def standing_out(image: Array, faint: float, s: Setting) -> list[list[Peak]]:
         peaks = []
         for n, top in enumerate(tops):
             tall = S[top] - level
-            dim = max(level, S.mean()) if s.floor_from_row_mean else level
+            dim = max(level, np.minimum(S, S[top]).mean()) if s.floor_from_row_mean else level
             ends = max(level + 1.5 * spread, dim + s.floor * (S[top] - dim))
             first = last = top
             lowest, highest = top - reach, top + reach
@@ -345,7 +350,8 @@ def standing_out(image: Array, faint: float, s: Setting) -> list[list[Peak]]:
                 left = i - (S[i] - half) / (S[i] - S[i - 1])
             if j < S.size - 1 and S[j + 1] <= half:
                 right = j + (S[j] - half) / (S[j] - S[j + 1])
-            peaks.append(Peak(first, last, height, left, right, added, (top - left, right - top), ends / (3 * box**2)))
+            pedestal = min(ends / (3 * box**2), height * ends / S[top])
+            peaks.append(Peak(first, last, height, left, right, added, (top - left, right - top), pedestal))
         rows.append(peaks)
     return rows
 
@@ -392,24 +398,131 @@ def averaged_halves(rows: list[list[Peak]], s: Setting) -> tuple[list[list[tuple
     return means, first, last
 
 
-def best_path(rows: list[list[Peak]], s: Setting) -> list[int]:
-    """Every candidate against every earlier one; latest row first, there the higher column first, wins a tie."""
-    earned: dict[tuple[int, int], float] = {}
-    averages, first, last = averaged_halves(rows, s)
+Carrier = tuple[float, float]
+Earned = dict[tuple[int, int], float]
+
+
+def judged(
+    rows: list[list[Peak]], averages: list[list[tuple[float, float]]], width: float | None, carrier: Carrier,
+    agreeing: float, s: Setting,
+) -> Earned:  # fmt: skip
+    """What every candidate earns, those that never are the line left out."""
+    earned: Earned = {}
     highest = [max(p.height for p in peaks) for peaks in rows if peaks]
     bright = sum(highest) / len(highest) / 4 if highest else 1.0
     for r, peaks in enumerate(rows):
         for k, peak in enumerate(peaks):
-            reward = 1.0
-            if s.width is not None:
+            alike = 1.0
+            if width is not None:
                 one_side, both = 2 * min(averages[r][k]), sum(averages[r][k])
-                off = min(abs(math.log(without_smoothing(w, peak.added) / s.width)) for w in (one_side, both))
+                off = min(abs(math.log(without_smoothing(w, peak.added) / width)) for w in (one_side, both))
                 if s.width_factor == 1:
-                    reward = float(off < TIE)
+                    alike = float(off < TIE)
                 else:
-                    reward = max(0.0, min(1.0, 2 * (1 - off / math.log(s.width_factor))))
-            if reward > TIE:
-                earned[r, k] = reward * (0.9 + 0.1 * min(1.0, peak.height / bright))
+                    alike = max(0.0, min(1.0, 2 * (1 - off / math.log(s.width_factor))))
+            near = 0.0
+            if agreeing > 0:
+                near = max(0.0, min(1.0, 2 - off_carrier(peak, r, carrier) / s.light_width))
+                if peak.height >= bright:
+                    alike = max(alike, 0.3 * near)
+                alike *= 1 - agreeing * 0.5 * (1 - near)
+            if alike > TIE:
+                earned[r, k] = alike * (0.9 + 0.1 * min(1.0, peak.height / bright)) + 0.5 * agreeing * near
+    return earned
+
+
+def off_carrier(peak: Peak, row: int, carrier: Carrier) -> float:
+    return abs(peak.middle - carrier[0] - carrier[1] * row)
+
+
+def straight_line(rows: list[list[Peak]], earned: Earned, chosen: list[int], s: Setting) -> tuple[Carrier, float]:
+    """The line (column at row 0, columns per row) most rows have a candidate on, and the share of rows that do."""
+    none = (0.0, 0.0), 0.0
+    at = [r for r, k in enumerate(chosen) if k >= 0]
+    n = len(at)
+    if n < 16:
+        return none
+    best, most = (0.0, 0.0), -1
+    for i in range(48):
+        start = i * n // 48
+        first, second = at[start], at[(start + n // 4 + i * 7 % 48 * n // 96) % n]
+        if first == second or abs(second - first) < len(rows) // 8:
+            continue
+        here, there = rows[first][chosen[first]].middle, rows[second][chosen[second]].middle
+        slope = (there - here) / (second - first)
+        tried = here - slope * first, slope
+        looked_at = range(0, len(rows), max(1, len(rows) // 64))
+        agree = sum(any(k >= 0 for k in [nearest_on(rows[r], r, earned, tried, s)]) for r in looked_at)
+        if agree > most:
+            best, most = tried, agree
+    if most < 0:
+        return none
+    count = 0
+    for _ in range(2):
+        on = [(r, k) for r in range(len(rows)) if (k := nearest_on(rows[r], r, earned, best, s)) >= 0]
+        count = len(on)
+        if count < 16:
+            return none
+        slope, column = np.polyfit([r for r, _ in on], [rows[r][k].middle for r, k in on], 1)
+        best = float(column), float(slope)
+    return best, count / sum(1 for peaks in rows if peaks)
+
+
+def nearest_on(peaks: list[Peak], row: int, earned: Earned, carrier: Carrier, s: Setting) -> int:
+    """The candidate nearest to the carrier within a line width, -1 where there is none."""
+    nearest, least = -1, s.light_width + 2 * TIE
+    for k, peak in enumerate(peaks):
+        off = off_carrier(peak, row, carrier)
+        if (row, k) in earned and off < least - TIE:
+            nearest, least = k, off
+    return nearest
+
+
+def without_glow(rows: list[list[Peak]], chosen: list[int]) -> list[int]:
+    """From darkness inwards, rows are dropped that rows d further on (median of seven) outshine 4 d times, at d up to 2 2 d times."""
+    for order in (list(range(len(rows))), list(range(len(rows)))[::-1]):
+        dark, nearest = 4, 8
+        for n, r in enumerate(order):
+            glow = False
+            for d in range(nearest, 33):
+                inner = [q for q in order[n + d : n + d + 7] if chosen[q] >= 0]
+                heights = sorted(rows[q][chosen[q]].height for q in inner)
+                if chosen[r] >= 0 and len(heights) > 3:
+                    glow |= (2 if d <= 2 else 4) * d * rows[r][chosen[r]].height < heights[len(heights) // 2] * (
+                        1 - TIE
+                    )
+            if chosen[r] >= 0 and (dark < 4 or not glow):
+                dark = 0
+            else:
+                chosen[r] = -1
+                dark += 1
+                nearest = 1
+    return chosen
+
+
+def best_path(rows: list[list[Peak]], s: Setting) -> list[int]:
+    """The best path; where most of it is straight, the best one again that knows so; without the lens' glow."""
+    averages, first, last = averaged_halves(rows, s)
+    earned = judged(rows, averages, s.width, (0.0, 0.0), 0.0, s)
+    chosen = richest_path(rows, earned, first, last, s)
+    carrier, share = straight_line(rows, earned, chosen, s)
+    if share >= 0.4:
+        width = s.width
+        if width is not None:
+            on = [
+                without_smoothing(sum(averages[r][k]), rows[r][k].added)
+                for r, k in earned
+                if off_carrier(rows[r][k], r, carrier) <= s.light_width + TIE
+            ]
+            seen = sorted(on)[len(on) // 2] if on else width
+            width = min(1.6 * width, max(width, seen))
+        earned = judged(rows, averages, width, carrier, min(1.0, (share - 0.4) / (0.7 - 0.4)), s)
+        chosen = richest_path(rows, earned, first, last, s)
+    return without_glow(rows, chosen)
+
+
+def richest_path(rows: list[list[Peak]], earned: Earned, first: Rows, last: Rows, s: Setting) -> list[int]:
+    """Every candidate against every earlier one; latest row first, there the higher column first, wins a tie."""
 
     def sideways(a: tuple[int, int], b: tuple[int, int]) -> float:
         return abs(rows[a[0]][a[1]].middle - rows[b[0]][b[1]].middle)
@@ -458,11 +571,50 @@ class Line:
     peak: Peak
 
 
+def before_glt(image: Array, s: Setting) -> Array:
+    """Light 0..255 that eq. (7) made these grey values of, told apart in steps of 2^-13 of the next power of two."""
+    steps = grey_steps(s)
+    light = 256.0 ** ((np.floor(image / steps + 1e-6) + 0.5) * steps / 255.0).clip(0, 1) ** (1 / s.p) - 1.0
+    return np.where(image < steps * (1 - 1e-6), 0.0, np.rint(light * 4096) / 4096)
+
+
+def after_glt(light: float, s: Setting) -> float:
+    """The grey value of this light, on straight lines between the steps' middles."""
+    steps = grey_steps(s)
+    middles = (np.arange(math.floor(255.0 / steps + 1e-6) + 1) + 0.5) * steps
+    table = np.rint((256.0 ** ((middles / 255.0).clip(0, 1) ** (1 / s.p)) - 1.0) * 4096)
+    table[0] = 0.0
+    entry = int(np.searchsorted(table, light * 4096))
+    if entry == 0:
+        return 0.0
+    if entry >= table.size:
+        return float((table.size - 1) * steps)
+    share = (light * 4096 - table[entry - 1]) / (table[entry] - table[entry - 1])
+    return float((entry - 1 + share + 0.5) * steps)
+
+
+def grey_steps(s: Setting) -> float:
+    """Grey levels per step of the light looked up."""
+    window = s.window if "sci" in s.order else 1
+    last = s.order[-1] == "glt" and "hdre" in s.order and "sci" in s.order
+    if last and s.order[0] == "hdre":
+        whole = 255 * 2.0**20
+    elif s.order.index("glt") < (s.order.index("sci") if "sci" in s.order else 0):
+        whole = 255 * 2.0 ** grey_bits(window) * window
+    else:
+        whole = 255 * 2.0 ** grey_bits(window)
+    return float(2.0 ** (math.floor(math.log2(whole)) + 1 - 13) * 255 / whole)
+
+
 def lines(image: Array, s: Setting) -> list[Line | None]:
     """MSNN and eq. (8) on one image whose black level is off; None where there is no line."""
-    faint = s.snr * noise_of(image) * STRICT
+    looked_for = image
+    if "glt" in s.order and s.candidates == "noise":
+        looked_for = before_glt(image, s)
+    faint = s.snr * noise_of(looked_for) * STRICT
     image = np.maximum(image, 0.0)
-    rows = standing_out(image, faint, s) if s.candidates == "noise" else above_threshold(image, faint, s)
+    looked_for = np.maximum(looked_for, 0.0)
+    rows = standing_out(looked_for, faint, s) if s.candidates == "noise" else above_threshold(image, faint, s)
     out: list[Line | None] = []
     for r, k in enumerate(best_path(rows, s) if s.continuity == "path" else the_line(rows, s)):
         out.append(None)
@@ -471,7 +623,10 @@ def lines(image: Array, s: Setting) -> list[Line | None]:
             mask = np.zeros(image.shape[1])
             mask[peak.first : peak.last + 1] = 1
             columns = np.arange(image.shape[1])
-            weight = np.maximum(image[r] - peak.pedestal, 0.0) * mask
+            pedestal = peak.pedestal
+            if looked_for is not image and "glt" in s.order and s.candidates == "noise":
+                pedestal = after_glt(pedestal, s)
+            weight = np.maximum(image[r] - pedestal, 0.0) * mask
             if weight.sum() > 0:
                 out[r] = Line((columns * weight).sum() / weight.sum(), peak)
     return out
