@@ -47,6 +47,7 @@ class Setting:
     jump: float = 10.0
     speed: float | None = None  # px per step of the surface on the sensor, for space-time analysis
     direction: int = 0
+    share: float | None = None  # of the way to the centre of gravity in time; None: with which rows agree best
     light_width: float = 3.0  # px, before GLT; 3 where nobody knows
 
 
@@ -504,6 +505,25 @@ def along_the_diagonals(
     return out
 
 
+def share_of_the_way(seen: list[tuple[Array, Array]], s: Setting) -> float:
+    """The share of the way to the centre of gravity in time with which neighbouring rows agree best."""
+    if s.share is not None:
+        return s.share
+    x, y = [], []
+    for column, apart in seen:
+        a, b = np.diff(column), np.diff(apart)
+        use = np.isfinite(a) & np.isfinite(b)
+        for values in (a, b):
+            if use.any():
+                use = use & (np.abs(np.where(use, values, 0.0)) <= 4.0 * 1.4826 * np.median(np.abs(values[use])))
+        x += list(-a[use])
+        y += list(b[use])
+    if np.sum(np.square(y)) <= 0:
+        return 0.6
+    best = min(1.0, max(0.0, float(np.dot(x, y) / np.sum(np.square(y)))))
+    return (best * len(x) + 0.6 * 30) / (len(x) + 30)
+
+
 def above_threshold(image: Array, faint: float, s: Setting) -> list[list[Peak]]:
     maxima = image.max(axis=1)
     asked = s.k * image.mean()
@@ -525,6 +545,7 @@ def range_columns(stack: list[list[NDArray[Any]]], s: Setting) -> Array:
         steps = min(12, math.ceil(2.2 * s.light_width / s.speed))
         need = s.window // 2 + steps
         way = s.direction
+        steps_on: list[tuple[Array, Array]] = []
         for n, span in enumerate(windows(len(stack), s)):
             centre = span[len(span) // 2]
             if not need <= centre < len(stack) - need:
@@ -535,5 +556,6 @@ def range_columns(stack: list[list[NDArray[Any]]], s: Setting) -> Array:
                 if not np.isfinite(rough[1]).any():
                     continue
                 way = -1 if np.nanmedian(rough[-1]) <= np.nanmedian(rough[1]) else 1
-            columns[n] = ways[way]
+            steps_on.append((columns[n], ways[way] - columns[n]))
+            columns[n] = columns[n] + share_of_the_way(steps_on, s) * (ways[way] - columns[n])
     return np.stack(columns, axis=1)
