@@ -19,9 +19,9 @@ Around the column that SCI, MSNN and COG found at profile n, one diagonal per im
 through the columns of the line's base, less the pedestal (see centroid.py); light between columns is interpolated. The
 light-weighted mean of their centres is the column in time (once: repeated it only adds noise and the pixels' grid).
 
-A diagonal needs images before and behind the window. The first and last few profiles of a scan have none and keep the
-plain centre of gravity. Which way the surface moves is seen from the first profile that has them: the way that makes
-neighbouring rows agree better.
+A diagonal needs images before and behind its own. Near the ends of a scan it is cut on both sides alike, for a line cut
+on one side would seem to have moved; cut diagonals tell less and have shares of their own. Which way the surface moves
+is seen from the first profile whose diagonals are whole: the way that makes neighbouring rows agree better.
 """
 
 from __future__ import annotations
@@ -59,15 +59,15 @@ def px_per_step(step_um: float, mm_per_pixel: float, angle_deg: float) -> float:
 
 @nb.njit(cache=True, nogil=True)
 def follow_points(  # type: ignore[no-untyped-def]
-    images, oldest, half_window, steps, speed, column_px, base, pedestal, top, scale, dark, corrected
+    images, centre, before, behind, half_window, steps, speed, column_px, base, pedestal, top, scale, dark, corrected
 ):
-    """Write the corrected columns, NaN where ``column_px`` is.
+    """Write the columns in time, NaN where ``column_px`` is.
 
-    ``images`` is a ring of 2 (half_window + steps) + 1 images, the oldest at ``oldest``; ``speed`` in px per step with
-    its sign; base (rows, 2) first and last column; pedestal (rows,) in light of one image.
+    ``images`` is a ring: image n of the scan lies at n modulo its length; ``centre`` is the profile's own, with
+    ``before`` images before and ``behind`` images behind it. ``speed`` in px per step with its sign; base (rows, 2)
+    first and last column; pedestal (rows,) in light of one image.
     """
     count, _, columns = images.shape
-    centre = half_window + steps
     for r in range(column_px.size):
         corrected[r] = column_px[r]
         if np.isnan(column_px[r]):
@@ -82,8 +82,9 @@ def follow_points(  # type: ignore[no-untyped-def]
                 continue
             left = min(int(x), columns - 2)
             share = x - left
-            for j in range(-half_window, half_window + 1):
-                image = (oldest + centre + j + k) % count
+            # The diagonal of image j is cut to equal lengths on both sides.
+            for j in range(max(-half_window, abs(k) - before), min(half_window, behind - abs(k)) + 1):
+                image = (centre + j + k) % count
                 light = (1.0 - share) * grey(images[image, r, left], top, scale, dark)
                 light += share * grey(images[image, r, left + 1], top, scale, dark)
                 light -= pedestal[r]
@@ -161,7 +162,8 @@ class SpaceTime:
         self._half = window // 2
         self._speed = speed_px
         self.direction = direction
-        self.share = Share(share)
+        self._given = share
+        self._shares: dict[int, Share] = {}
         self._steps = min(MOST_STEPS, max(1, math.ceil(reach_px / speed_px)))
         self._ring: NDArray[Any] | None = None
         self._shape = (2 * (self._half + self._steps) + 1, rows, columns)
@@ -170,9 +172,12 @@ class SpaceTime:
         self._waiting: deque[Waiting] = deque()
 
     @property
-    def profiles_without(self) -> int:
-        """How many profiles at each end of a scan keep the plain centre of gravity (of a sliding window)."""
-        return self._steps
+    def share(self) -> float:
+        """Of the way to the centre of gravity in time, as seen so far from whole diagonals."""
+        return self._share_of(self._half + self._steps).value
+
+    def _share_of(self, reach: int) -> Share:
+        return self._shares.setdefault(reach, Share(self._given))
 
     def add(self, image: NDArray[Any]) -> None:
         """Keep a copy of the next image."""
@@ -189,30 +194,44 @@ class SpaceTime:
         """(column_px, rest) of the profiles whose images are all there; at the ``end`` of all others too."""
         out: list[tuple[Float64, Any]] = []
         need = self._half + self._steps
-        while self._waiting and (end or self._seen - 1 >= self._waiting[0].image + need):
+        while self._waiting:
+            wanted = self._waiting[0].image + need
+            if self.direction == 0:
+                # The first ones wait for the first whole diagonals, which show the way.
+                wanted = max(wanted, 2 * need)
+            if not end and self._seen - 1 < wanted:
+                break
+            if self.direction == 0:
+                self.direction = self._way()
             one = self._waiting.popleft()
-            whole = one.image >= need and self._seen - 1 == one.image + need
-            out.append((self._corrected(one) if whole else one.column_px, one.rest))
+            out.append((self._corrected(one), one.rest))
         return out
+
+    def _reach(self, one: Waiting) -> tuple[int, int]:
+        need = self._half + self._steps
+        return min(need, one.image), min(need, self._seen - 1 - one.image)
+
+    def _way(self) -> int:
+        """Which way the surface moves, from the waiting profile with the longest diagonals; 0 when it has no rows."""
+        one = max(self._waiting, key=lambda waiting: min(self._reach(waiting)))
+        rough = {way: roughness(self._followed(one, way)) for way in (-1, 1)}
+        if math.isnan(rough[1]):
+            return 0
+        return -1 if rough[-1] <= rough[1] else 1
 
     def _corrected(self, one: Waiting) -> Float64:
         if self.direction == 0:
-            ways = {way: self._followed(one, way) for way in (-1, 1)}
-            rough = {way: roughness(column) for way, column in ways.items()}
-            if math.isnan(rough[1]):
-                return one.column_px
-            self.direction = -1 if rough[-1] <= rough[1] else 1
-            in_time_px = ways[self.direction]
-        else:
-            in_time_px = self._followed(one, self.direction)
-        self.share.learn(one.column_px, in_time_px)
-        return one.column_px + self.share.value * (in_time_px - one.column_px)
+            return one.column_px
+        in_time_px = self._followed(one, self.direction)
+        share = self._share_of(min(self._reach(one)))
+        share.learn(one.column_px, in_time_px)
+        return one.column_px + share.value * (in_time_px - one.column_px)
 
     def _followed(self, one: Waiting, way: int) -> Float64:
         assert self._ring is not None
         out = np.empty_like(one.column_px)
         follow_points(
-            self._ring, self._seen % self._shape[0], self._half, self._steps, way * self._speed, one.column_px,
+            self._ring, one.image, *self._reach(one), self._half, self._steps, way * self._speed, one.column_px,
             one.base, one.pedestal, *self._grey, out,
         )  # fmt: skip
         return out

@@ -17,7 +17,7 @@ FINER, ROWS, COLUMNS, STEPS = 4, 96, 64, 26
 PLACE, FWHM_PX, GRAIN_PX, UM_PER_PX = 30.0, 3.03, 1.67, 14.2
 GAINS = (20.0, 60.0, 180.0)
 TIMES = (100.0, 300.0, 900.0)
-ENDS = 7  # profiles at each end of the scan without images before or behind
+ENDS = 7  # profiles at each end of the scan with cut diagonals
 
 
 @pytest.fixture(scope="module")
@@ -80,15 +80,31 @@ def test_which_way_the_surface_moves_is_seen(light: NDArray[np.float64]) -> None
     assert np.array_equal(measured(backwards), measured(backwards, direction="lower"))
 
 
-def test_no_profile_is_lost_and_the_first_comes_before_the_scan_ends(light: NDArray[np.float64]) -> None:
+@pytest.mark.parametrize(("direction", "first", "together"), [("higher", 11, 1), ("auto", 18, 8)])
+def test_no_profile_is_lost_and_the_first_come_before_the_scan_ends(
+    light: NDArray[np.float64], direction: str, first: int, together: int
+) -> None:
     steps = recorded(light)
-    stream = ProfileStream(Recipe.named("PRECISE"), header_for(steps, TIMES, width=FWHM_PX))
+    recipe = Recipe.named("PRECISE").with_settings({"sta.direction": direction})
+    stream = ProfileStream(recipe, header_for(steps, TIMES, width=FWHM_PX))
     counts = [len(stream.push(images)) for images in steps]
     ends = stream.finish()
-    assert counts[:11] == [0] * 11
-    assert counts[11:] == [1] * (STEPS - 11)
+    # With the way unknown the first ones wait until it shows.
+    assert counts == [0] * first + [together] + [1] * (STEPS - first - 1)
     assert sum(counts) + len(ends) == STEPS - 4
     assert stream.finish() == []
+
+
+def test_near_the_ends_of_a_scan_the_noise_grows_little_by_little(light: NDArray[np.float64]) -> None:
+    steps = recorded(light)
+    recipe = Recipe.named("PRECISE")
+    whole = product(steps, header_for(steps, TIMES, width=FWHM_PX), recipe)
+    plain = product(steps, header_for(steps, TIMES, width=FWHM_PX), recipe.with_settings({"sta.share": "0"}))
+    noise = [1.4826 * np.median(np.abs(whole[:, [n, -1 - n]] - PLACE)) for n in range(ENDS)]
+    before = 1.4826 * np.median(np.abs(plain - PLACE))
+    assert noise[0] < 1.2 * before
+    assert noise[3] < 0.8 * before
+    assert noise[ENDS - 1] < 0.7 * before
 
 
 def test_a_bright_spot_on_the_surface_does_not_pull_the_line() -> None:

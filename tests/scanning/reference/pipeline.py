@@ -485,16 +485,20 @@ def column_of(found: list[Line | None]) -> Array:
 
 
 def along_the_diagonals(
-    singles: list[Array], centre: int, steps: int, speed: float, found: list[Line | None], s: Setting
+    singles: list[Array], centre: int, steps: int, speed: float, found: list[Line | None], s: Setting, last: int
 ) -> Array:
-    """Centre of gravity in time of the light of surface points that move ``speed`` px per image."""
+    """Centre of gravity in time of the light of surface points that move ``speed`` px per image.
+
+    Images from 0 to ``last`` are there; a diagonal that would need others is cut on both sides alike.
+    """
     out = column_of(found)
     for r, line in enumerate(found):
         if line is None:
             continue
         light, when = [], []
         for j in range(-(s.window // 2), s.window // 2 + 1):
-            for k in range(-steps, steps + 1):
+            a = min(steps, centre + j, last - centre - j)
+            for k in range(-a, a + 1):
                 P = np.maximum(singles[centre + j + k][r], 0.0)  # noqa: N806
                 x = line.column + speed * k
                 if max(0, line.peak.first - 1) <= x <= min(P.size - 1, line.peak.last + 1):
@@ -545,17 +549,24 @@ def range_columns(stack: list[list[NDArray[Any]]], s: Setting) -> Array:
         steps = min(12, math.ceil(2.2 * s.light_width / s.speed))
         need = s.window // 2 + steps
         way = s.direction
-        steps_on: list[tuple[Array, Array]] = []
-        for n, span in enumerate(windows(len(stack), s)):
-            centre = span[len(span) // 2]
-            if not need <= centre < len(stack) - need:
-                continue
-            ways = {w: along_the_diagonals(singles, centre, steps, w * s.speed, found[n], s) for w in (-1, 1)}
+        seen: dict[int, list[tuple[Array, Array]]] = {}
+        centres = [span[len(span) // 2] for span in windows(len(stack), s)]
+        for n, centre in enumerate(centres):
+            # A profile comes out with the last image it needs, the first ones with that of the first whole diagonals.
+            last = min(max(centre, need) + need, len(stack) - 1)
             if way == 0:
-                rough = {w: np.abs(np.diff(c)) for w, c in ways.items()}
+                there = [m for m in range(n, len(centres)) if centres[m] + s.window // 2 <= last]
+                longest = max(there, key=lambda m: min(need, centres[m], last - centres[m]))
+                rough = {
+                    w: np.abs(np.diff(along_the_diagonals(singles, centres[longest], steps, w * s.speed, found[longest], s, last)))
+                    for w in (-1, 1)
+                }  # fmt: skip
                 if not np.isfinite(rough[1]).any():
                     continue
                 way = -1 if np.nanmedian(rough[-1]) <= np.nanmedian(rough[1]) else 1
-            steps_on.append((columns[n], ways[way] - columns[n]))
-            columns[n] = columns[n] + share_of_the_way(steps_on, s) * (ways[way] - columns[n])
+            last = len(stack) - 1
+            apart = along_the_diagonals(singles, centre, steps, way * s.speed, found[n], s, last) - columns[n]
+            reach = min(need, centre, last - centre)
+            seen.setdefault(reach, []).append((columns[n], apart))
+            columns[n] = columns[n] + share_of_the_way(seen[reach], s) * apart
     return np.stack(columns, axis=1)
