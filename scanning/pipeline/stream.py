@@ -284,7 +284,13 @@ class ProfileStream:
             if LEAST_SPEED * light_width <= speed <= MOST_SPEED * light_width:
                 direction = {"auto": 0, "higher": 1, "lower": -1}[sta.direction]
                 self._space_time = SpaceTime(
-                    h.rows, h.columns, sci.window, speed, direction, REACH * light_width, *self._chain.single_grey,
+                    h.rows,
+                    h.columns,
+                    sci.window,
+                    speed,
+                    direction,
+                    REACH * light_width,
+                    *self._chain.single_grey,
                     sta.share,
                 )
 

@@ -557,10 +557,11 @@ def range_columns(stack: list[list[NDArray[Any]]], s: Setting) -> Array:
             if way == 0:
                 there = [m for m in range(n, len(centres)) if centres[m] + s.window // 2 <= last]
                 longest = max(there, key=lambda m: min(need, centres[m], last - centres[m]))
-                rough = {
-                    w: np.abs(np.diff(along_the_diagonals(singles, centres[longest], steps, w * s.speed, found[longest], s, last)))
+                ways = {
+                    w: along_the_diagonals(singles, centres[longest], steps, w * s.speed, found[longest], s, last)
                     for w in (-1, 1)
-                }  # fmt: skip
+                }
+                rough = {w: np.abs(np.diff(column)) for w, column in ways.items()}
                 if not np.isfinite(rough[1]).any():
                     continue
                 way = -1 if np.nanmedian(rough[-1]) <= np.nanmedian(rough[1]) else 1
