@@ -184,6 +184,7 @@ class ProfileStream:
                     direction,
                     REACH * light_width,
                     *self._chain.single_grey,
+                    sta.share,
                 )
 
     def provenance(self) -> dict[str, Any]:
@@ -211,6 +212,7 @@ class ProfileStream:
             "candidates": None if settled is None else settled.candidates,
             "continuity": None if settled is None else settled.continuity,
             "space_time_direction": None if self._space_time is None else self._space_time.direction,
+            "space_time_share": None if self._space_time is None else self._space_time.share,
             "estimated": [] if settled is None else list(settled.estimated),
             "notes": notes,
             "versions": {
