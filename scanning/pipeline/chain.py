@@ -105,6 +105,7 @@ class Chain:
                 grey[0, -1] = GREY_TOP
             self._tables = fixed_point(grey, self._bits)
         self._fuses = hdre is not None
+        self._open_rows = np.zeros(rows, np.bool_)
         self._saturated_from = window if hdre is None or hdre.saturated == "all" else 1
 
         # In front of SCI, behind it, or (no SCI) the only stage: where the tables are applied.
@@ -220,8 +221,11 @@ class Chain:
         if not self._fuses:
             look_up(self._fused, images[0], self._tables[0], self._saturation)
             return
-        for e, image in enumerate(images):
-            fuse_codes(self._fused, image, self._tables[e], self._saturation, e == 0)
+        last = len(images) - 1
+        for e in range(last, -1, -1):
+            fuse_codes(
+                self._fused, images[e], self._tables[e], self._saturation, self._open_rows, e == last, e == 0
+            )  # fmt: skip
 
     def _apply_tables_to_sums(self, sums: list[Int32]) -> None:
         assert self._tables is not None
@@ -229,5 +233,8 @@ class Chain:
             look_up(self._fused, sums[0], self._tables[0], self._saturation * self._window)
             return
         top = int(self._tables[0, -1])
-        for e, one in enumerate(sums):
-            fuse_sums(self._fused, one, self._tables[e], self._saturated_from, top, e == 0)
+        last = len(sums) - 1
+        for e in range(last, -1, -1):
+            fuse_sums(
+                self._fused, sums[e], self._tables[e], self._saturated_from, top, self._open_rows, e == last, e == 0
+            )  # fmt: skip

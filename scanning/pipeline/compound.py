@@ -27,16 +27,13 @@ SUM_MASK = (1 << COUNT_SHIFT) - 1
 @nb.njit(cache=True, nogil=True)
 def _accumulate(sums, image, top, counting, sign):  # type: ignore[no-untyped-def]
     """sums += sign * min(image, top), plus sign << 24 where the image is saturated and ``counting``."""
-    rows, columns = image.shape
-    one_saturated = np.int32(sign << 24) if counting else np.int32(0)
-    limit = np.int32(top)
-    for r in range(rows):
-        for c in range(columns):
-            code = np.int32(image[r, c])
-            if code >= limit:
-                sums[r, c] += np.int32(sign) * limit + one_saturated
-            else:
-                sums[r, c] += np.int32(sign) * code
+    limit, times = np.int32(top), np.int32(sign)
+    one_saturated = np.int32(sign << COUNT_SHIFT) if counting else np.int32(0)
+    for r in range(image.shape[0]):
+        row, out = image[r], sums[r]
+        for c in range(row.size):  # without a branch, so that it is vector instructions
+            code = np.int32(row[c])
+            out[c] += np.int32(times * min(code, limit) + (one_saturated if code >= limit else np.int32(0)))
 
 
 class CompoundWindow:

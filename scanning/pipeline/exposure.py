@@ -44,33 +44,64 @@ def exposure_grey(
     return np.stack(rows)
 
 
-@nb.njit(cache=True, nogil=True)
-def fuse_codes(fused, image, table, saturation, shortest):  # type: ignore[no-untyped-def]
-    """Write table[code] where this exposure is not saturated; exposures come shortest first, so the longest wins.
+OPEN = np.int32(-1)
+"""Stands where all exposures so far are saturated, until a shorter one says more."""
 
-    ``table`` is (saturation + 1,) int32; the shortest exposure writes everywhere, saturated pixels included.
+
+@nb.njit(cache=True, nogil=True)
+def fuse_codes(fused, image, table, saturation, open_rows, longest, shortest):  # type: ignore[no-untyped-def]
+    """Write table[code] where this exposure is not saturated and no longer one has said anything.
+
+    Exposures come longest first: hardly a pixel of it is saturated, so the others are looked at in few rows only
+    (``open_rows``, (rows,) bool, kept from one to the next). ``table`` is (saturation + 1,) int32; what is saturated
+    in the shortest too is table[saturation] of that.
     """
-    rows, columns = image.shape
-    for r in range(rows):
-        for c in range(columns):
-            code = np.int64(image[r, c])
-            if code < saturation:
-                fused[r, c] = table[code]
-            elif shortest:
-                fused[r, c] = table[saturation]
+    top = np.int64(saturation)
+    for r in range(image.shape[0]):
+        if not (longest or open_rows[r]):
+            continue
+        row, out = image[r], fused[r]
+        some = np.uint8(0)
+        for c in range(row.size):
+            some |= np.uint8(row[c] >= saturation)
+        if longest:
+            for c in range(row.size):
+                out[c] = table[min(np.int64(row[c]), top)]
+            open_rows[r] = some != 0
+            if some != 0 and not shortest:
+                for c in range(row.size):
+                    out[c] = OPEN if row[c] >= saturation else out[c]
+        else:
+            for c in range(row.size):
+                if out[c] == OPEN and (row[c] < saturation or shortest):
+                    out[c] = table[min(np.int64(row[c]), top)]
 
 
 @nb.njit(cache=True, nogil=True)
-def fuse_sums(fused, sums, table, saturated_from, top, shortest):  # type: ignore[no-untyped-def]
+def fuse_sums(fused, sums, table, saturated_from, top, open_rows, longest, shortest):  # type: ignore[no-untyped-def]
     """The same on compounded images (HDRE-I): a pixel is saturated from ``saturated_from`` saturated images up."""
-    rows, columns = sums.shape
-    for r in range(rows):
-        for c in range(columns):
-            entry = np.int64(sums[r, c])
-            if (entry >> COUNT_SHIFT) < saturated_from:
-                fused[r, c] = table[entry & SUM_MASK]
-            elif shortest:
-                fused[r, c] = top
+    limit = np.int32(saturated_from << COUNT_SHIFT)
+    for r in range(sums.shape[0]):
+        if not (longest or open_rows[r]):
+            continue
+        row, out = sums[r], fused[r]
+        some = np.uint8(0)
+        for c in range(row.size):
+            some |= np.uint8(row[c] >= limit)
+        if longest:
+            for c in range(row.size):
+                out[c] = table[row[c] & SUM_MASK]
+            open_rows[r] = some != 0
+            if some != 0:
+                for c in range(row.size):
+                    if row[c] >= limit:
+                        out[c] = top if shortest else OPEN
+        else:
+            for c in range(row.size):
+                if out[c] == OPEN and row[c] < limit:
+                    out[c] = table[row[c] & SUM_MASK]
+                elif out[c] == OPEN and shortest:
+                    out[c] = top
 
 
 @nb.njit(cache=True, nogil=True)

@@ -19,3 +19,18 @@ def grey(code, top, scale, dark):  # type: ignore[no-untyped-def]
     """Light of one code above the dark level, int64."""
     value = min(np.int64(code), top) * scale - dark
     return value if value > 0 else np.int64(0)
+
+
+@nb.njit(cache=True, nogil=True)
+def count_saturated(image, saturation):  # type: ignore[no-untyped-def]
+    """How many codes of a (rows, columns) image are at ``saturation`` or above."""
+    count = np.int64(0)
+    for r in range(image.shape[0]):
+        row = image[r]
+        some = np.uint8(0)
+        for c in range(row.size):
+            some |= np.uint8(row[c] >= saturation)
+        if some != 0:
+            for c in range(row.size):
+                count += row[c] >= saturation
+    return count

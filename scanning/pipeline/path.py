@@ -106,10 +106,15 @@ def likeness(average, widened, expected, factor):  # type: ignore[no-untyped-def
 def likeness_of(width, widened, expected, factor):  # type: ignore[no-untyped-def]
     """The same of one width."""
     width = np.sqrt(max(width * width - widened, 0.0625 * width * width))
-    off = abs(np.log(width / expected))
+    times = width / expected if width > expected else expected / width
     if factor <= 1.0:
-        return 1.0 if off < TIE else 0.0
-    return max(0.0, min(1.0, 2.0 * (1.0 - off / np.log(factor))))
+        return 1.0 if np.log(times) < TIE else 0.0
+    # A logarithm costs as much as all the rest of a candidate, and at both ends of the scale none is needed.
+    if times >= factor:
+        return 0.0
+    if times * times <= factor:
+        return 1.0
+    return max(0.0, min(1.0, 2.0 * (1.0 - np.log(times) / np.log(factor))))
 
 
 @nb.njit(cache=True, nogil=True)
@@ -118,7 +123,10 @@ def mean_of_highest(counts, height):  # type: ignore[no-untyped-def]
     total, rows = 0.0, 0
     for r in range(counts.size):
         if counts[r] > 0:
-            total += height[r, : counts[r]].max()
+            highest = height[r, 0]
+            for k in range(1, counts[r]):
+                highest = max(highest, height[r, k])
+            total += highest
             rows += 1
     return total / rows if rows > 0 else 1.0
 
@@ -324,6 +332,8 @@ def best_path(  # type: ignore[no-untyped-def]
             value, from_row, from_peak = own, -1, -1
             for s in range(living - 1, -1, -1):  # the latest first: it wins a tie
                 q, p = alive[s, 0], alive[s, 1]
+                if score[q, p] + own <= value + TIE:
+                    continue  # even for nothing this is no better way
                 moved = abs(shape[r, k, 0] - shape[q, p, 0])
                 starts, ends = track[r, k, 0] >= q - IN_COMMON, track[q, p, 1] <= r + IN_COMMON
                 is_step = starts and ends and r - q <= LEAP_ROWS
@@ -344,6 +354,8 @@ def best_path(  # type: ignore[no-untyped-def]
             keep = True
             if s < living:
                 for n in range(living, fresh):
+                    if score[alive[n, 0], alive[n, 1]] < score[q, p]:
+                        continue
                     moved = abs(shape[alive[n, 0], alive[n, 1], 0] - shape[q, p, 0])
                     if moved > gate + TIE:
                         continue

@@ -38,13 +38,13 @@ def box_for(width_px: float | None) -> int:
 
 
 def kind_for(box: int, top: int, scale: int) -> Any:
-    """The narrowest type that holds every smoothed sum of light up to ``top * scale``: unsigned, but int64 over 32 bits."""
+    """The narrowest type that holds every smoothed sum of light up to ``top * scale``: unsigned, int64 over 32 bits."""
     largest = 3 * box * box * top * scale
     return np.uint16 if largest < 1 << 16 else np.uint32 if largest < 1 << 32 else np.int64
 
 
 class Rows:
-    """Scratch: ``light`` of three rows; their sum ``three`` and ``once`` boxed, with darkness on both sides; ``smooth``.
+    """Scratch: ``light`` of three rows, their sum ``three``, ``once`` boxed, both with darkness around, and ``smooth``.
 
     ``looked_at`` has room for the rows that level and spread come from, and for the steps in them.
     """

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scanning.errors import BadInput
 from scanning.frames import StackHeader
 from scanning.pipeline.chain import REACH, Chain
+from scanning.pipeline.grey import count_saturated
 from scanning.pipeline.settle import GRAIN_PX, Settled, has_unknowns, settle
 from scanning.pipeline.space_time import SpaceTime, px_per_step
 from scanning.recipe import Recipe
@@ -129,7 +130,7 @@ class ProfileStream:
         assert self._chain is not None
         used = [images[e] for e in self._chain.selected]
         for image in used:
-            self._saturated += int(np.count_nonzero(image >= self.header.saturation))
+            self._saturated += int(count_saturated(image, self.header.saturation))
             self._pixels += image.size
         step = self._steps
         self._steps += 1
