@@ -2,7 +2,8 @@
 
 A range pixel is one row of one profile. Times alone say more about the machine than about the program, so every figure
 stands beside a ratio: to reading the same frames from memory, to NF, to the same operations in NumPy and in OpenCV. All
-methods take turns and the best of several rounds counts, so a busy neighbour hits none of them alone.
+methods take turns and the best of several rounds counts, and one thread's cost is processor time, so a busy neighbour
+hits none of them alone; what two threads gain is of wall time, and means something only on an idle machine.
 
 The frames are simulated scan images of R1 with stray light, all different and many times the size of the cache. The
 NumPy reference is the float64 one the tests hold the product to, one equation after the other; it is slow, so it gets a
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import platform
 import resource
 import subprocess
@@ -77,18 +79,20 @@ class Method:
     rounds: int = 0
 
 
-def in_turn(methods: Sequence[Method], rounds: int) -> dict[str, float]:
-    """Best time per range pixel of every method, ns; they take turns."""
-    best: dict[str, float] = {}
+def in_turn(methods: Sequence[Method], rounds: int) -> tuple[dict[str, float], dict[str, float]]:
+    """Best processor time and best wall time per range pixel of every method, ns; they take turns."""
+    cpu: dict[str, float] = {}
+    wall: dict[str, float] = {}
     for turn in range(rounds):
         for method in methods:
             if turn >= (method.rounds or rounds):
                 continue
-            started = time.perf_counter()
+            wall_started, started = time.perf_counter(), time.process_time()
             pixels = method.run()
-            ns = (time.perf_counter() - started) / pixels * 1e9
-            best[method.name] = min(ns, best.get(method.name, np.inf))
-    return best
+            used, took = time.process_time() - started, time.perf_counter() - wall_started
+            cpu[method.name] = min(used / pixels * 1e9, cpu.get(method.name, np.inf))
+            wall[method.name] = min(took / pixels * 1e9, wall.get(method.name, np.inf))
+    return cpu, wall
 
 
 def extraction(
@@ -181,10 +185,11 @@ def machine() -> str:
         names = [line.split(":", 1)[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line]
         model = f"{names[0]}, {len(names)} cores" if names else model
     root = Path(__file__).resolve().parents[1]
+    load = f"load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "load unknown"
     git = subprocess.run(["git", "-C", str(root), "describe", "--always", "--dirty"], capture_output=True, text=True)
     return (
         f"{model}; Python {platform.python_version()}, NumPy {np.__version__}, numba {nb.__version__}; "
-        f"commit {git.stdout.strip() or 'unknown'}"
+        f"{load}; commit {git.stdout.strip() or 'unknown'}"
     )
 
 
@@ -224,10 +229,10 @@ def methods(frames: Frames, rounds: int) -> str:
         Method("numpy NF, literal MSNN", reference(frames[:2], "NF", LITERAL), 1),
         Method("numpy HDRE-II", reference(frames[:6], "HDRE-II"), 1),
     ]
-    ns = in_turn(entries, rounds)
+    ns, wall = in_turn(entries, rounds)
     read = ns["read"]
     gb_s = frames.shape[3] / read
-    gain = read / ns["read, 2 threads"]
+    gain = wall["read"] / wall["read, 2 threads"]
     two = f"{gb_s * gain:.1f} GB/s with two (gain {gain:.2f})"
     out = [f"Reading memory: {gb_s:.1f} GB/s with one thread ({read:.1f} ns per row of one image), {two}.\n"]
     rows = []
@@ -239,7 +244,7 @@ def methods(frames: Frames, rounds: int) -> str:
             label, f"{own:.0f}", f"{own / ns[reading_label]:.2f}", f"{100.0 * images * read / own:.1f}",
             f"{ns[f'numpy {label}'] / own:.0f}" if f"numpy {label}" in ns else "",
             f"{ns[f'opencv {label}'] / own:.0f}" if f"opencv {label}" in ns else "",
-            f"{own / ns[f'{label}, 2 threads']:.2f}",
+            f"{wall[label] / wall[f'{label}, 2 threads']:.2f}",
         ])  # fmt: skip
     titles = (
         "method", "ns per range pixel", "x NF", "% of read bandwidth", "x faster than NumPy", "than OpenCV + NumPy",

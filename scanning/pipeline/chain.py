@@ -67,7 +67,7 @@ class Scratch:
             np.empty((rows, most), np.int64), np.empty((rows, most), np.int64), self._alive,
         )  # fmt: skip
 
-    def arrays(self) -> tuple[Any, ...]:
+    def arrays(self) -> tuple[Any, Any, Any, Any, Any, Any, Any, Any, Any, Any]:
         """What `extract_line` wants, in its order."""
         of_rows = (self.base, self.shape, self.half, self.height, self.pedestal)
         return (

@@ -292,7 +292,7 @@ def smoothed(image: Array, box: int) -> Array:
     tall = np.pad(image, ((1, 1), (0, 0)), mode="edge")
     sums = np.pad(tall[:-2] + tall[1:-1] + tall[2:], ((0, 0), (box - 1, box - 1)))
     weights = [box - abs(away) for away in range(1 - box, box)]
-    return np.sum([w * sums[:, i : i + image.shape[1]] for i, w in enumerate(weights)], axis=0)
+    return np.asarray(np.sum([w * sums[:, i : i + image.shape[1]] for i, w in enumerate(weights)], axis=0))
 
 
 def standing_out(image: Array, faint: float, s: Setting) -> list[list[Peak]]:
