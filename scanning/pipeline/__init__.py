@@ -42,22 +42,25 @@ _cache_for_these_sources()
 
 
 def warm_up(progress: Callable[[int, int], None] | None = None) -> None:
-    """Compile every kernel for 8 and 16 bit, so that the first scan does not wait; later processes load the cache.
+    """Compile every kernel for 8, 10 and 16 bit, so that the first scan does not wait; later processes load the cache.
 
     ``progress(done, total)`` is called after each of the parts.
     """
     from scanning.pipeline.stream import ProfileStream
 
+    # Integers are as narrow as saturation and dark level allow, so each of these meets kernels the others do not.
     jobs = [
-        (name, kind, bits)
-        for bits, kind in ((8, np.uint8), (16, np.uint16))
-        for name in ("NF", "SCI", "HDRE-I", "HDRE-II", "PRECISE")
-    ]
-    for done, (name, kind, bits) in enumerate(jobs, start=1):
+        ("NF", 255, 2.0), ("NF", 255, 2.3), ("SCI", 255, 2.0), ("SCI", 255, 2.3), ("HDRE-I", 255, 2.0),
+        ("HDRE-II", 255, 2.0), ("PRECISE", 255, 2.0), ("NF", 1023, 2.0), ("NF", 65535, 2.0), ("SCI", 65535, 2.0),
+        ("HDRE-I", 65535, 2.0), ("HDRE-II", 65535, 2.0), ("NF", 255, None),
+    ]  # fmt: skip
+    for done, (name, saturation, dark) in enumerate(jobs, start=1):
+        kind = np.uint8 if saturation < 256 else np.uint16
         times = (1.0, 2.0) if name[:4] in ("HDRE", "PREC") else (1.0,)
         header = StackHeader(
             rows=16, columns=64, steps=5, exposures_us=times, step_um=1.0, row_pitch_um=1.0, mm_per_pixel=1.0,
-            saturation=(1 << bits) - 1, bits=bits,
+            saturation=saturation, dark_level=dark, line_width_px=None if dark is None else 3.0,
+            bits=8 * np.dtype(kind).itemsize,
         )  # fmt: skip
         recipe = Recipe.named(name)
         stream = ProfileStream(recipe.with_settings({"sci.mode": "sliding"}) if recipe.compound else recipe, header)

@@ -16,6 +16,7 @@ import pytest
 from numpy.typing import NDArray
 
 from scanning.pipeline import warm_up
+from scanning.pipeline.line import extract_line
 from scanning.recipe import Recipe
 from tests.scanning.pipeline.agreement import Steps, header_for, product
 from tests.scanning.pipeline.scenes import line, shot
@@ -69,3 +70,11 @@ def test_warming_up_tells_how_far_it_is() -> None:
     told: list[tuple[int, int]] = []
     warm_up(lambda done, total: told.append((done, total)))
     assert [done for done, _ in told] == list(range(1, told[-1][1] + 1))
+
+
+def test_after_warming_up_a_scan_compiles_nothing(steps: Steps) -> None:
+    warm_up()
+    before = set(extract_line.signatures)
+    for name in ("NF", "SCI", "HDRE-I", "HDRE-II", "PRECISE"):
+        columns(steps, name)
+    assert set(extract_line.signatures) == before
