@@ -53,6 +53,10 @@ RING_SHARE = 0.05
 FURTHEST_RING_UM = 150.0
 #: Missing material that reaches no further than this behind the end of the light is the edge's own wear.
 BRINK_UM = 60.0
+#: Relative standard uncertainty of what is added to a depth for smoothing: damages are rounded, conical or stepped.
+U_FILLED_IN = 0.75
+#: Brightness of damage against the surface around it, logarithm: usually up to half or double.
+U_LOG_CONTRAST = 0.4
 #: Draws of noise with which the excess of a largest value over the true one is estimated.
 NOISE_DRAWS = 24
 #: Enclosed sound islands up to this many times the least damage area belong to the damage.
@@ -65,7 +69,8 @@ class DamageFinding:
 
     ``volume_mm3`` includes undefined pixels enclosed by the damage, interpolated; ``volume_lower_bound_mm3`` only
     what was measured; ``volume_interpolated_mm3`` also undefined pixels open to the edge. ``depth_um`` is the deepest
-    point of the residual smoothed with 15 um, ``d99_um`` the 99th percentile of the same inside the mask.
+    point: of the residual smoothed with 15 um, less what noise adds to a largest value, plus what smoothing filled in;
+    ``d99_um`` the 99th percentile of the smoothed residual inside the mask.
     ``mask_runs`` lists the mask as [row, first profile, length].
     """
 
@@ -387,6 +392,7 @@ def findings(
         volume = lower + filled * pixel_area * 1e-9
         open_mm3 = extended * pixel_area * 1e-9
         u_volume = budget.volume_mm3(volume, int(np.count_nonzero(measured)), pixel_area, u_filled * pixel_area * 1e-9)
+        u_volume = math.hypot(u_volume, volume * rim_relative(float(np.count_nonzero(mask)) * pixel_area, settings))
 
         judged = mask & valid[crop] & (density >= LEAST_DENSITY)
         if not judged.any():
@@ -404,7 +410,12 @@ def findings(
             profile_pitch_um,
         )
         depth_um = max(depth_um - excess, 0.0)
-        u_depth = budget.depth_um(depth_um, math.hypot(sigma_here, 0.3 * excess))
+        wider = np.where(judged, detection.wide_image.value[crop], -np.inf)
+        filled_um, share = filled_in(depth_um, float(wider.max()), settings)
+        u_depth = budget.depth_um(
+            depth_um, math.hypot((1.0 + share) * sigma_here, 0.3 * excess, U_FILLED_IN * filled_um)
+        )
+        depth_um += filled_um
 
         rows_at, profiles_at = np.nonzero(whole)
         row_range = (int(rows_at.min()) + crop[0].start, int(rows_at.max()) + crop[0].start + 1)
@@ -555,6 +566,31 @@ def excess_of_largest(
         noise = noise[margin[0] : margin[0] + core.shape[0], margin[1] : margin[1] + core.shape[1]] * scale
         largest[draw] = float((core + noise)[inside].max())
     return max(0.0, float(largest.mean()) - top)
+
+
+def filled_in(depth_um: float, wider_um: float, settings: InspectionSettings) -> tuple[float, float]:
+    """How much of the depth smoothing and the laser line's own width have filled in, um, and the share it rests on.
+
+    On a rounded floor the loss grows with the square of the width of the kernel, so the heavier smoothing, which made
+    ``wider_um`` of the same damage, tells what the lighter one took. A narrow or one-sided damage follows no such law:
+    at most a quarter of the depth is added.
+    """
+    small, wide, blur = settings.small_scale_um**2, settings.wide_scale_um**2, settings.blur_um**2
+    if wide <= small:
+        return 0.0, 0.0
+    share = (small + blur) / (wide - small)
+    return float(np.clip(share * (depth_um - wider_um), 0.0, 0.25 * depth_um)), share
+
+
+def rim_relative(area_um2: float, settings: InspectionSettings) -> float:
+    """Relative standard uncertainty of a volume from its rim: where bright meets dark, the bright height counts more.
+
+    A height is the mean over the laser line's width, weighted by the light. For a paraboloid of area pi a^2 whose
+    brightness differs from its surroundings by u(ln C), blurred with standard deviation s: 8 s^2 u(ln C) / a^2.
+    """
+    if area_um2 <= 0:
+        return 0.0
+    return min(0.5, 8.0 * settings.blur_um**2 * U_LOG_CONTRAST * math.pi / area_um2)
 
 
 def _runs(mask: Mask, first_row: int, first_profile: int) -> tuple[tuple[int, int, int], ...]:
