@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import sys
 
-from benchmarks import damage, ghosts, precision, speed
+from benchmarks import coverage, damage, ghosts, precision, speed
 
-QUESTIONS = {"precision": precision.main, "damage": damage.main, "ghosts": ghosts.main, "speed": speed.main}
+QUESTIONS = {
+    "precision": precision.main, "damage": damage.main, "coverage": coverage.main, "ghosts": ghosts.main,
+    "speed": speed.main,
+}  # fmt: skip
 
 
 def main() -> int:
