@@ -376,12 +376,12 @@ def extract_line(  # type: ignore[no-untyped-def]
     gate_px, gate_max_px, best_seed, light_width, jump, reach, box,
     highest, light, base, shape, height, counts, chosen, rows_of, seen, maxima, half, pedestal, average, track, score,
     back, alive,
-    column_px, peak, width_px,
+    column_px, peak, width_px, confidence,
 ):  # fmt: skip
     """MSNN then COG on one (rows, columns) image of integer codes (see `grey.grey` for top, scale, dark).
 
-    Writes, per row, column_px (px from 0, NaN undefined), peak (light of the line's maximum) and width_px (full width
-    at half maximum, px). What lies between ``box`` and ``column_px`` is scratch that keeps its size.
+    Writes, per row, column_px (px from 0, NaN undefined), peak (light of the line's maximum), width_px (full width at
+    half maximum, px) and confidence (0 to 1, see `path.trust`; NaN without a path). What lies between ``box`` and ``column_px`` is scratch that keeps its size.
     """
     rows = image.shape[0]
     faint = snr * noise_of(image, top, scale, linear, shift) * STRICT if snr > 0.0 else 0.0
@@ -404,10 +404,11 @@ def extract_line(  # type: ignore[no-untyped-def]
                     half[r, p, :] = 0.5 * shape[r, p, 1]
         find_path(
             counts, shape, half, height, widened, expected, factor, light_width, jump, gate_max_px, average, track,
-            score, back[0], back[1], alive, chosen,
+            score, back[0], back[1], alive, chosen, confidence,
         )  # fmt: skip
     else:
         find_line(counts, shape, height, expected, factor, gate_px, gate_max_px, best_seed, chosen)
+        confidence[:] = np.nan
     for r in range(rows):
         peak_of_row = chosen[r]
         if peak_of_row < 0:

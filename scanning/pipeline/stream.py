@@ -75,7 +75,8 @@ class Profile:
     """One row of heights-to-be: the line's column in every image row, NaN where it was not seen.
 
     ``column_px`` (rows,) from 0; ``intensity`` the line's maximum in grey levels above dark, as the centroid saw it;
-    ``width_px`` its full width at half maximum. ``position_um`` along the scan, from the first step, is that of the
+    ``width_px`` its full width at half maximum; ``confidence`` (0 to 1) how sure it is that this is the line, NaN where
+    the recipe does not say. ``position_um`` along the scan, from the first step, is that of the
     middle of the images used. ``saturated`` of ``frame_pixels`` pixels read since the last profile were saturated.
     """
 
@@ -86,6 +87,7 @@ class Profile:
     width_px: Float32
     saturated: int
     frame_pixels: int
+    confidence: Float32
 
 
 @dataclass(frozen=True)
@@ -195,6 +197,7 @@ class ProfileStream:
                 width_px=lines[2],
                 saturated=self._saturated,
                 frame_pixels=self._pixels,
+                confidence=lines[3],
             )
             self._profiles += 1
             self._saturated = self._pixels = 0
@@ -425,8 +428,8 @@ class _Chain:
         )  # fmt: skip
         self._rows = rows
 
-    def run(self, images: list[Image]) -> tuple[Float64, Float32, Float32] | None:
-        """(column_px, intensity, width_px) once enough images are in, else None."""
+    def run(self, images: list[Image]) -> tuple[Float64, Float32, Float32, Float32] | None:
+        """(column_px, intensity, width_px, confidence) once enough images are in, else None."""
         image: NDArray[Any] = images[0]
         self._last = images[0]
         if self._table_first:
@@ -450,11 +453,14 @@ class _Chain:
         column_px = np.empty(self._rows)
         peak = np.empty(self._rows)
         width_px = np.empty(self._rows)
+        confidence = np.empty(self._rows)
         extract_line(
             image, self._top, self._scale, self._dark, *self._linear, *self._line, highest, *self._scratch, column_px,
-            peak, width_px,
+            peak, width_px, confidence,
         )
-        return column_px, (peak / self._grey_level).astype(np.float32), width_px.astype(np.float32)
+        confidence[np.isnan(column_px)] = np.nan
+        intensity = (peak / self._grey_level).astype(np.float32)
+        return column_px, intensity, width_px.astype(np.float32), confidence.astype(np.float32)
 
     @property
     def single(self) -> NDArray[Any]:
@@ -549,6 +555,7 @@ def process_stack(
     height_um = np.full((header.rows, expected), np.nan, np.float32)
     intensity = np.full((header.rows, expected), np.nan, np.float32)
     width_px = np.full((header.rows, expected), np.nan, np.float32)
+    confidence = np.full((header.rows, expected), np.nan, np.float32)
     saturated = pixels = done = 0
 
     def keep(profiles: list[Profile]) -> None:
@@ -558,6 +565,7 @@ def process_stack(
             height_um[:, profile.index] = heights_um(profile.column_px, header, calibration)
             intensity[:, profile.index] = profile.intensity
             width_px[:, profile.index] = profile.width_px
+            confidence[:, profile.index] = profile.confidence
             saturated += profile.saturated
             pixels += profile.frame_pixels
 
@@ -580,6 +588,7 @@ def process_stack(
         profile_pitch_um=recipe.profile_pitch_um(header.step_um),
         intensity=intensity,
         width_px=width_px,
+        confidence=confidence,
         saturated=saturated,
         frame_pixels=pixels,
         wall_s=time.perf_counter() - wall,
