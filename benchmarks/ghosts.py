@@ -39,6 +39,8 @@ DEVELOPED_ON = (101, 102)
 HELD_OUT = (9301, 9302, 9303)
 EXPOSURES_US = (100.0, 300.0, 500.0, 700.0, 900.0)
 ROWS, COLUMNS, STEPS = 1000, 256, 20
+#: Steps at which a scan of a region begins: in the middle of its largest damage.
+FIRST_STEP = {"R1": 0, "R2": 42, "R3": 110}
 WRONG_PX = 5.0
 ABOVE_NOISE = 4.0
 LEAST_NOISE = 0.5
@@ -149,13 +151,14 @@ def shown(case: Case) -> Shown:
     )
     renderer = Renderer(part, rows=ROWS, columns=COLUMNS)
     alone = Renderer(replace(part, reflections=()), rows=ROWS, columns=COLUMNS)
-    truth = part.truth(rows=ROWS, steps=STEPS, columns=COLUMNS)
-    column_px = np.where(truth.visible, truth.column_px, np.nan).astype(np.float64)
+    first = FIRST_STEP[case.region]
+    truth = part.truth(rows=ROWS, steps=first + STEPS, columns=COLUMNS)
+    column_px = np.where(truth.visible, truth.column_px, np.nan).astype(np.float64)[:, first:]
     frames = np.empty((STEPS, len(EXPOSURES_US), ROWS, COLUMNS), np.uint8)
     line, stray = np.zeros((ROWS, STEPS)), np.zeros((ROWS, STEPS))
     grey_per_e = (renderer.sensor.saturation - renderer.sensor.dark_level) / 9000.0
     for step in range(STEPS):
-        light, own = renderer.irradiance(step * STEP_UM), alone.irradiance(step * STEP_UM)
+        light, own = (which.irradiance((first + step) * STEP_UM) for which in (renderer, alone))
         line[:, step] = _around(own, column_px[:, step]) * grey_per_e
         stray[:, step] = _around(light - own, column_px[:, step]) * grey_per_e
         for number, exposure in enumerate(EXPOSURES_US):

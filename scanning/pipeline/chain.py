@@ -156,8 +156,8 @@ class Chain:
         self._scratch = Scratch(rows, columns, box, kind)
         self._rows = rows
 
-    def run(self, images: list[Image]) -> tuple[Float64, Float32, Float32] | None:
-        """(column_px, intensity, width_px) once enough images are in, else None."""
+    def run(self, images: list[Image]) -> tuple[Float64, Float32, Float32, Float32] | None:
+        """(column_px, intensity, width_px, confidence) once enough images are in, else None."""
         image: NDArray[Any] = images[0]
         self._last = images[0]
         if self._table_first:
@@ -177,18 +177,20 @@ class Chain:
                 assert self._tone_p is not None
                 mean = image / float(self._window << self._bits)
                 image = fixed_point(tone(mean, self._tone_p), 20)
-        column_px, peak, width_px = np.empty((3, self._rows))
+        column_px, peak, width_px, confidence = np.empty((4, self._rows))
         scratch = self._scratch
         highest = np.empty(self._rows, image.dtype)
         while True:
             most = extract_line(
                 image, self._top, self._scale, self._dark, *self._linear, *self._line, highest, *scratch.arrays(),
-                column_px, peak, width_px,
+                column_px, peak, width_px, confidence,
             )  # fmt: skip
             if most <= scratch.most:
                 break
             scratch.make_room_for(most)
-        return column_px, (peak / self._grey_level).astype(np.float32), width_px.astype(np.float32)
+        confidence[np.isnan(column_px)] = np.nan
+        intensity = (peak / self._grey_level).astype(np.float32)
+        return column_px, intensity, width_px.astype(np.float32), confidence.astype(np.float32)
 
     @property
     def single(self) -> NDArray[Any]:

@@ -372,12 +372,13 @@ def extract_line(  # type: ignore[no-untyped-def]
     image, top, scale, dark, linear, shift, by_noise, by_path, k, floor, from_row_mean, ceiling, snr, grain_px, expected,
     factor, gate_px, gate_max_px, best_seed, light_width, jump, reach, box,
     highest, light, of_three, noise, maxima, lit, of_row, of_rows, counts, chosen, of_path, column_px, peak, width_px,
+    confidence,
 ):  # fmt: skip
     """MSNN then COG on one (rows, columns) image of integer codes (see `grey.grey` for top, scale, dark).
 
-    Writes, per row, column_px (px from 0, NaN undefined), peak (light of the line's maximum) and width_px (full width
-    at half maximum, px), and returns the most candidates in one row. If the scratch has no room for so many, nothing is
-    written. What lies between ``box`` and ``column_px`` is scratch that keeps its size; see `chain.Scratch`.
+    Writes, per row, column_px (px from 0, NaN undefined), peak (light of the line's maximum), width_px (full width at
+    half maximum, px) and confidence (0 to 1, see `path.trust`; NaN without a path), and returns the most candidates in
+    one row. If the scratch has no room for so many, nothing is written. What lies between ``box`` and ``column_px`` is scratch that keeps its size; see `chain.Scratch`.
     """
     rows = image.shape[0]
     faint = snr * noise_of(image, top, scale, linear, shift, noise) * STRICT if snr > 0.0 else 0.0
@@ -399,10 +400,11 @@ def extract_line(  # type: ignore[no-untyped-def]
         average, track, score, back_row, back_peak, alive = of_path
         find_path(
             counts, shape, half, height, widened, expected, factor, light_width, jump, gate_max_px, average, track,
-            score, back_row, back_peak, alive, chosen,
+            score, back_row, back_peak, alive, chosen, confidence,
         )  # fmt: skip
     else:
         find_line(counts, shape, height, expected, factor, gate_px, gate_max_px, best_seed, chosen)
+        confidence[:] = np.nan
     for r in range(rows):
         peak_of_row = chosen[r]
         if peak_of_row < 0:

@@ -51,6 +51,9 @@ ROWS_INSIDE = 7
 GLOW_ROWS = 32
 BORDER_ROWS = 8
 BRINK_ROWS = 2
+MOST_BLURRED = 1.6
+UNSEEN, OFF_THE_CARRIER = 0.9, 0.5
+AROUND, SEEN_AROUND = 8, 0.65
 ASIDE = 0.5
 BONUS = 0.5
 BY_LIGHT = 0.1
@@ -250,9 +253,9 @@ def width_on(counts, shape, earned, average, carrier, width, widened, expected):
 @nb.njit(cache=True, nogil=True)
 def find_path(  # type: ignore[no-untyped-def]
     counts, shape, half, height, widened, expected, factor, width, jump, gate, average, track, score, back_row,
-    back_peak, alive, chosen,
+    back_peak, alive, chosen, confidence,
 ):  # fmt: skip
-    """Choose the candidate of every row that is on the best path, -1 where there is none.
+    """Choose the candidate of every row that is on the best path, -1 where there is none; see `trust` for confidence.
 
     ``expected`` width (px) as the image shows it and the factor it may be off (inf: any); ``width`` of the light, the
     unit of moving. ``average, track, score, back_row, back_peak, alive`` are scratch.
@@ -264,15 +267,54 @@ def find_path(  # type: ignore[no-untyped-def]
     judge(counts, shape, height, average, widened, expected, factor, bright, width, carrier, 0.0, earned)
     best_path(counts, shape, earned, width, jump, gate, track, score, back_row, back_peak, alive, chosen)
     share = find_carrier(counts, shape, earned, chosen, width, carrier)
-    if share < LEAST_SHARE:
-        leave_glow_out(height, chosen)
-        return
-    if np.isfinite(factor):
-        expected = min(1.6 * expected, max(expected, width_on(counts, shape, earned, average, carrier, width, widened, expected)))
-    agreeing = min(1.0, (share - LEAST_SHARE) / (FULL_SHARE - LEAST_SHARE))
-    judge(counts, shape, height, average, widened, expected, factor, bright, width, carrier, agreeing, earned)
-    best_path(counts, shape, earned, width, jump, gate, track, score, back_row, back_peak, alive, chosen)
+    agreeing = 0.0
+    if share >= LEAST_SHARE:
+        if np.isfinite(factor):
+            blurred = width_on(counts, shape, earned, average, carrier, width, widened, expected)
+            expected = min(MOST_BLURRED * expected, max(expected, blurred))
+        agreeing = min(1.0, (share - LEAST_SHARE) / (FULL_SHARE - LEAST_SHARE))
+        judge(counts, shape, height, average, widened, expected, factor, bright, width, carrier, agreeing, earned)
+        best_path(counts, shape, earned, width, jump, gate, track, score, back_row, back_peak, alive, chosen)
     leave_glow_out(height, chosen)
+    trust(
+        counts, shape, average, widened, expected, factor, width, carrier, agreeing, earned, chosen, confidence
+    )
+
+
+@nb.njit(cache=True, nogil=True)
+def trust(  # type: ignore[no-untyped-def]
+    counts, shape, average, widened, expected, factor, width, carrier, agreeing, earned, chosen, confidence
+):
+    """Write how sure it is, 0 to 1, that the path's candidate is the line; NaN where there is none.
+
+    The product of three: how near the carrier it is (off it, how much the row's best other candidate earns in
+    comparison), whether its width is the line's, and how many of the rows around it have a line. Above 0.9 are only
+    points on a straight surface that most rows agree on. How bright it is was tried and says no more.
+    """
+    rows = counts.size
+    for r in range(rows):
+        k = chosen[r]
+        if k < 0:
+            confidence[r] = np.nan
+            continue
+        rival = 0.0
+        for p in range(counts[r]):
+            if p != k:
+                rival = max(rival, earned[r, p])
+        rival = min(1.0, rival / earned[r, k])
+        alone = (UNSEEN - (UNSEEN - OFF_THE_CARRIER) * agreeing) * (1.0 - 0.5 * rival)
+        near = 0.0
+        if agreeing > 0.0:
+            near = agreeing * max(0.0, min(1.0, 2.0 - abs(shape[r, k, 0] - carrier[0] - carrier[1] * r) / width))
+        alike = 1.0
+        if np.isfinite(factor):
+            alike = 0.5 + 0.5 * min(1.0, 2.0 * likeness(average[r, k], widened, expected, factor))
+        seen, there = 0, 0
+        for q in range(max(0, r - AROUND), min(rows, r + AROUND + 1)):
+            there += 1
+            if chosen[q] >= 0:
+                seen += 1
+        confidence[r] = (alone + (1.0 - alone) * near) * alike * min(1.0, seen / (SEEN_AROUND * there))
 
 
 @nb.njit(cache=True, nogil=True)

@@ -43,7 +43,8 @@ class Profile:
     """One row of heights-to-be: the line's column in every image row, NaN where it was not seen.
 
     ``column_px`` (rows,) from 0; ``intensity`` the line's maximum in grey levels above dark, as the centroid saw it;
-    ``width_px`` its full width at half maximum. ``position_um`` along the scan, from the first step, is that of the
+    ``width_px`` its full width at half maximum; ``confidence`` (0 to 1) how sure it is that this is the line, NaN where
+    the recipe does not say. ``position_um`` along the scan, from the first step, is that of the
     middle of the images used. ``saturated`` of ``frame_pixels`` pixels read since the last profile were saturated.
     """
 
@@ -54,6 +55,7 @@ class Profile:
     width_px: Float32
     saturated: int
     frame_pixels: int
+    confidence: Float32
 
 
 class ProfileStream:
@@ -146,6 +148,7 @@ class ProfileStream:
                 width_px=lines[2],
                 saturated=self._saturated,
                 frame_pixels=self._pixels,
+                confidence=lines[3],
             )
             self._profiles += 1
             self._saturated = self._pixels = 0

@@ -60,6 +60,7 @@ def process_stack(
     height_um = np.full((header.rows, expected), np.nan, np.float32)
     intensity = np.full((header.rows, expected), np.nan, np.float32)
     width_px = np.full((header.rows, expected), np.nan, np.float32)
+    confidence = np.full((header.rows, expected), np.nan, np.float32)
     saturated = pixels = done = 0
 
     def keep(profiles: list[Profile]) -> None:
@@ -69,6 +70,7 @@ def process_stack(
             height_um[:, profile.index] = heights_um(profile.column_px, header, calibration)
             intensity[:, profile.index] = profile.intensity
             width_px[:, profile.index] = profile.width_px
+            confidence[:, profile.index] = profile.confidence
             saturated += profile.saturated
             pixels += profile.frame_pixels
 
@@ -91,6 +93,7 @@ def process_stack(
         profile_pitch_um=recipe.profile_pitch_um(header.step_um),
         intensity=intensity,
         width_px=width_px,
+        confidence=confidence,
         saturated=saturated,
         frame_pixels=pixels,
         wall_s=time.perf_counter() - wall,
