@@ -255,7 +255,8 @@ class GrblStage:
 
     def _read_settings(self) -> None:
         found = self.link.settings()
-        for number, value in self._wanted_settings.items():
+        # Soft limits ($20) are refused while homing ($22) is off, so they come last.
+        for number, value in sorted(self._wanted_settings.items(), key=lambda item: (item[0] == 20, item[0])):
             if number not in found or abs(found[number] - value) > 0.001:
                 self.link.command(f"${number}={value:g}" if value == int(value) else f"${number}={value:.4f}")
         if self._wanted_settings:

@@ -31,6 +31,9 @@ from scanning.rig.protocols import LinkQuality
 ANSWER_S = 2.0
 #: How long a controller may take from a reset to its greeting: Arduino bootloaders take 1.6 to 2 s.
 GREETING_S = 3.0
+#: How long to wait for the greeting after each reset that is sent, in seconds. A controller that is free greets in
+#: milliseconds; only one that did not heed the first reset gets a second.
+RESET_PATIENCE_S = (0.7, 0.7, GREETING_S)
 #: Silence that means the controller has said all it had to say, in seconds.
 QUIET_S = 0.05
 #: Longest stretch of waiting before looking whether another thread called a halt, in seconds.
@@ -153,8 +156,12 @@ class GrblLink:
         """Soft reset: laser off, planner empty, position lost if it moved. Returns when the controller is ready."""
         self._halted = None
         self._buffer.clear()
-        self.realtime(b"\x18")
-        greeted = self._await_greeting(GREETING_S)
+        # After a limit alarm the firmware spends half a second on its message and then forgets the resets of that time.
+        greeted = False
+        for patience in RESET_PATIENCE_S:
+            self.realtime(b"\x18")
+            if greeted := self._await_greeting(patience):
+                break
         self.drain()
         if not greeted and not self._answers_status():
             raise StageFault(

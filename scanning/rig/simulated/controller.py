@@ -36,6 +36,8 @@ END_STOP_MM = 0.5
 MINIMUM_FEED_MM_S = 1 / 60
 VERSION = "1.1h"
 BUILD = "20190830"
+#: How long the firmware waits after a critical ALARM line; a reset that comes meanwhile is forgotten.
+ALARM_MESSAGE_S = 0.5
 #: Bootloader and start-up of an Arduino board after a hardware reset, in seconds; bytes sent meanwhile are lost.
 BOOT_S = 1.5
 
@@ -122,6 +124,7 @@ class Controller:
         self._g92 = np.zeros(3, np.float32)
         self._gc = np.zeros(3, np.float32)
         self._dwell_until: float | None = None
+        self._deaf_until: float | None = None
         self._critical = self._check = self._jog_cancelled = self._homing_hit = False
         self._wco_in = self._ov_in = 0
         self._program: Program = self._main()
@@ -275,6 +278,7 @@ class Controller:
 
     def _next_internal(self) -> float | None:
         due = [self._motion.next_event(), self._boot_until, self._fault_at, self._switch_time(), self._dwell_until]
+        due.append(self._deaf_until)
         if self._incoming:
             due.append(self._incoming[0][0])
         return min((t for t in due if t is not None), default=None)
@@ -286,6 +290,9 @@ class Controller:
             self._greet()
         if self._dwell_until is not None and now >= self._dwell_until:
             self._dwell_until = None
+        if self._deaf_until is not None and now >= self._deaf_until:
+            self._deaf_until = None
+            self._say("[MSG:Reset to continue]")
         if self._fault_at is not None and now >= self._fault_at:
             self._fault_at, fire = None, self.faults.in_move
             self.faults.in_move = None
@@ -301,6 +308,8 @@ class Controller:
 
     def _take_byte(self, byte: int) -> None:
         if self.faults.mute or self._boot_until is not None:
+            return
+        if byte == _RESET and self._deaf_until is not None:
             return
         if byte == _RESET:
             self._soft_reset()
@@ -351,7 +360,7 @@ class Controller:
         self._spindle_rpm = self._idle_scale = 0.0
         self._g92 = np.zeros(3, np.float32)
         self._gc = self._mpos(self._motion.end)
-        self._dwell_until = None
+        self._dwell_until = self._deaf_until = None
         self._critical = self._check = self._jog_cancelled = self._homing_hit = False
         self._wco_in = self._ov_in = 0
         self._restart_program()
@@ -428,7 +437,7 @@ class Controller:
         self._critical = True
         self._restart_program()
         self._say(f"ALARM:{code}")
-        self._say("[MSG:Reset to continue]")
+        self._deaf_until = self.now + ALARM_MESSAGE_S
 
     def _homing_failed(self, code: int) -> None:
         """The firmware alarms, resets itself and greets; the $H gets no answer."""
