@@ -141,6 +141,10 @@ class GrblStage:
 
     def move_to(self, steps: int) -> None:
         """Move to ``steps`` from zero and return at standstill. Refuses positions outside the travel before moving."""
+        self.move_to_while(steps, _nothing)
+
+    def move_to_while(self, steps: int, meanwhile: Callable[[], None]) -> None:
+        """`move_to`, doing ``meanwhile`` on the way."""
         here = self.position_steps
         target_mm = steps * self.step_um / 1000
         if not -1e-9 <= target_mm <= self.travel_mm + 1e-9:
@@ -149,8 +153,10 @@ class GrblStage:
                 "move the region or the start of the scan."
             )
         if steps == here:
+            meanwhile()
             return
         self.confirm()
+        on_the_way = _Once(meanwhile)
         self._count = None  # until it is proven to be there again
         machine_mm = self._zero_machine_mm + self._direction * target_mm
         feed = "" if self._feed_sent else f"F{self._feed_mm_min:.3f}"
@@ -159,7 +165,8 @@ class GrblStage:
         expected_s = _travel_time_s(distance_mm, self._feed_mm_min / 60, self.controller_settings[120])
         for attempt in range(1, ATTEMPTS + 1):
             last = attempt == ATTEMPTS
-            if self.link.attempt(lines, timeout_s=1.0 + 1.5 * expected_s, last=last) is not None:
+            sent = self.link.attempt(lines, timeout_s=1.0 + 1.5 * expected_s, last=last, meanwhile=on_the_way)
+            if sent is not None:
                 self.link.ask_status()
                 self._expected_machine_mm = machine_mm
                 break
@@ -172,6 +179,7 @@ class GrblStage:
                 )
         self._feed_sent = True
         self._count = steps
+        on_the_way.end()
 
     def confirm(self) -> None:
         """Check that the last move ended where it should: Idle, and at the place within the report's resolution."""
@@ -355,6 +363,30 @@ class GrblStage:
         if where is None and status.work_mm is not None:
             where = self._zero_machine_mm + status.work_mm
         return where is None or abs(where - machine_mm) <= SANITY_MM
+
+
+def _nothing() -> None:
+    pass
+
+
+class _Once:
+    """Calls ``act`` the first time only, and keeps what it raises until `end`: the move must be seen through."""
+
+    def __init__(self, act: Callable[[], None]) -> None:
+        self._act: Callable[[], None] | None = act
+        self._raised: Exception | None = None
+
+    def __call__(self) -> None:
+        act, self._act = self._act, None
+        if act is not None:
+            try:
+                act()
+            except Exception as fault:
+                self._raised = fault
+
+    def end(self) -> None:
+        if self._raised is not None:
+            raise self._raised
 
 
 class GrblLaser:

@@ -34,6 +34,9 @@ GREETING_S = 3.0
 #: How long to wait for the greeting after each reset that is sent, in seconds. A controller that is free greets in
 #: milliseconds; only one that did not heed the first reset gets a second.
 RESET_PATIENCE_S = (0.7, 0.7, GREETING_S)
+#: How long the answer to a question asked in passing may take, in seconds. The firmware answers in milliseconds; a busy
+#: host or a slow adapter may take longer, and that is no fault of the line.
+ASKED_S = 0.5
 #: Silence that means the controller has said all it had to say, in seconds.
 QUIET_S = 0.05
 #: Longest stretch of waiting before looking whether another thread called a halt, in seconds.
@@ -209,15 +212,18 @@ class GrblLink:
             "check its cable and supply, then home the stage."
         )
 
-    def attempt(self, lines: list[str], *, timeout_s: float, last: bool = False) -> list[str] | None:
+    def attempt(
+        self, lines: list[str], *, timeout_s: float, last: bool = False, meanwhile: Callable[[], None] | None = None
+    ) -> list[str] | None:
         """Send ``lines`` together and wait for all answers; None when noise ate one, so the caller may try again.
 
         ``timeout_s`` is the longest silence allowed between two answers. The ``last`` attempt takes a refusal at its
-        word. Raises `StageFault` for a refusal that correct lines can provoke, an alarm, a reset, a lost port.
+        word. ``meanwhile`` is called when the lines are out; it must not use this link. Raises `StageFault` for a
+        refusal that correct lines can provoke, an alarm, a reset, a lost port.
         """
         said: list[str] = []
         try:
-            self._send(lines, said, timeout_s)
+            self._send(lines, said, timeout_s, meanwhile)
         except _Refused as refusal:
             if last or refusal.number not in NOISE_ERRORS:
                 raise StageFault(f"Stage on {self.port}: {error_sentence(refusal.number)}.") from refusal
@@ -243,7 +249,9 @@ class GrblLink:
                 "check its cable and supply, then home the stage."
             ) from silence
 
-    def _send(self, lines: Iterable[str], said: list[str], timeout_s: float) -> None:
+    def _send(
+        self, lines: Iterable[str], said: list[str], timeout_s: float, meanwhile: Callable[[], None] | None = None
+    ) -> None:
         self._settle()
         self._unsettled = True
         waiting: deque[str] = deque()
@@ -258,6 +266,8 @@ class GrblLink:
             waiting.append(line)
             used += size
             self.max_outstanding_bytes = max(self.max_outstanding_bytes, used)
+        if meanwhile is not None:
+            meanwhile()
         while waiting:
             self._answered(waiting, said, timeout_s)
         self._unsettled = False
@@ -311,7 +321,7 @@ class GrblLink:
         if not self._asked:
             return None
         self._asked = False
-        deadline = self._clock() + 0.1
+        deadline = self._clock() + ASKED_S
         while (text := self._next(deadline)) is not None:
             if text.startswith("<"):
                 return self._parse_status(text)
