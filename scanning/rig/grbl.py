@@ -263,23 +263,15 @@ class GrblStage:
 
     def _read_settings(self) -> None:
         found = self.link.settings()
+        self._check_settings(found | self._wanted_settings)  # before anything is written that cannot work
         # Soft limits ($20) are refused while homing ($22) is off, so they come last.
         for number, value in sorted(self._wanted_settings.items(), key=lambda item: (item[0] == 20, item[0])):
             if number not in found or abs(found[number] - value) > 0.001:
                 self.link.command(f"${number}={value:g}" if value == int(value) else f"${number}={value:.4f}")
         if self._wanted_settings:
             found = self.link.settings()
-        missing = [number for number in (100, 110, 120, 130) if number not in found]
-        if missing:
-            raise StageFault(
-                f"The controller on {self.link.port} does not tell its setting ${missing[0]}; "
-                "it does not speak GRBL 1.1: check the rig's controller."
-            )
+        self._check_settings(found)
         self.controller_settings = found
-        self._check_step(found)
-        self._feed_mm_min = min(self._wanted_feed or found[110], found[110])
-        if self._feed_mm_min < 1:
-            raise StageFault(f"The stage's feed is {self._feed_mm_min:g} mm/min; GRBL needs at least 1 mm/min.")
         homes_negative = bool(int(found.get(23, 0)) & 1)
         if self._zero == "homing":
             self._direction = 1 if homes_negative else -1
@@ -291,13 +283,33 @@ class GrblStage:
                 if len(sizes) >= 2:
                     self.link.rx_bytes = min(int(sizes[1]), 128)
 
-    def _check_step(self, found: Mapping[int, float]) -> None:
+    def _check_settings(self, found: Mapping[int, float]) -> None:
+        """Raise `StageFault` for settings that a scan cannot be made with; take feed and travel from them."""
         port = self.link.port
+        missing = [number for number in (100, 110, 120, 130) if number not in found]
+        if missing:
+            raise StageFault(
+                f"The controller on {port} does not tell its setting ${missing[0]}; "
+                "it does not speak GRBL 1.1: check the rig's controller."
+            )
+        impossible = [
+            number for number in (100, 110, 120, 130) if not (math.isfinite(found[number]) and found[number] > 0)
+        ]
+        if impossible:
+            raise StageFault(
+                f"The controller on {port} has ${impossible[0]} = {found[impossible[0]]:g}; set it above 0."
+            )
         rate = found[100] * found[110] / 60
         if rate > MAX_STEP_RATE_HZ:
             raise StageFault(
                 f"The controller on {port} is set to {rate:.0f} steps a second ($100 x $110 / 60), more than the "
                 f"{MAX_STEP_RATE_HZ} it can do; lower $110 to {int(MAX_STEP_RATE_HZ * 60 / found[100])} mm/min or less."
+            )
+        self._feed_mm_min = found[110] if self._wanted_feed is None else self._wanted_feed
+        if not 1 <= self._feed_mm_min <= found[110]:
+            raise StageFault(
+                f"The rig's feed is {self._feed_mm_min:g} mm/min but the controller on {port} moves at 1 to "
+                f"{found[110]:g} mm/min ($110); correct the rig's feed or $110."
             )
         usable = found[130] - (found.get(27, 0.0) if self._zero == "homing" else 0.0)
         self.travel_mm = usable if self._wanted_travel_mm is None else self._wanted_travel_mm
