@@ -336,8 +336,6 @@ class GrblStage:
         self.link.command("G21 G90 G94 G17 G54")
         self.link.command("G92 X0", repeatable=True)
         status = self.link.status()
-        if status.machine_mm is None and status.work_mm is None:
-            raise StageFault(f"The controller on {self.link.port} reports no position; set $10=1 or $10=3.")
         self._zero_machine_mm = status.machine_mm if status.machine_mm is not None else 0.0
         self._count, self._zero_given = 0, True
 
@@ -371,10 +369,11 @@ class GrblStage:
             self.link.listen(POLL_S)
 
     def _is_at(self, status: Status, machine_mm: float) -> bool:
+        # What was reported is compared, not what was derived from an offset that only some reports carry.
         where = status.machine_mm
-        if where is None and status.work_mm is not None:
+        if "WPos" in status.fields and status.work_mm is not None:
             where = self._zero_machine_mm + status.work_mm
-        return where is None or abs(where - machine_mm) <= SANITY_MM
+        return where is not None and abs(where - machine_mm) <= SANITY_MM
 
 
 def _nothing() -> None:

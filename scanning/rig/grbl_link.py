@@ -148,6 +148,24 @@ class GrblLink:
         finally:
             self._expecting_greeting = False
 
+    def _catches_up(self) -> bool:
+        """Whether the controller answers a status request, and with it everything it was asked before.
+
+        A slow board, or one in its bootloader, may greet twice: once for itself, once for the reset sent meanwhile. The
+        second greeting must not come in the middle of the talk that follows. What is heard before the answer is old.
+        """
+        self._expecting_greeting = True
+        try:
+            for _ in range(ATTEMPTS):
+                self.realtime(b"?")
+                deadline = self._clock() + ASKED_S
+                while (line := self._read_line(deadline)) is not None:
+                    if self._parse_status(line) is not None:
+                        return True
+            return False
+        finally:
+            self._expecting_greeting = False
+
     def _answers_status(self) -> bool:
         try:
             self.status(timeout_s=0.5)
@@ -166,7 +184,7 @@ class GrblLink:
             if greeted := self._await_greeting(patience):
                 break
         self.drain()
-        if not greeted and not self._answers_status():
+        if not self._catches_up() and not greeted:
             raise StageFault(
                 f"The stage controller on {self.port} did not come back after a reset; switch it off and on."
             )
@@ -406,6 +424,8 @@ class GrblLink:
             work = float(fields["WPos"].split(",")[0]) if "WPos" in fields else None
             free = int(fields["Bf"].split(",")[0]) if "Bf" in fields else None
         except ValueError:
+            return None
+        if machine is None and work is None:  # every report tells one of them; one without was damaged on its way
             return None
         if machine is None and work is not None and self._wco_mm is not None:
             machine = work + self._wco_mm
