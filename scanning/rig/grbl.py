@@ -152,10 +152,10 @@ class GrblStage:
                 f"Position {target_mm:.3f} mm is outside the stage's travel of 0 to {self.travel_mm:g} mm; "
                 "move the region or the start of the scan."
             )
+        self.confirm()
         if steps == here:
             meanwhile()
             return
-        self.confirm()
         on_the_way = _Once(meanwhile)
         self._count = None  # until it is proven to be there again
         machine_mm = self._zero_machine_mm + self._direction * target_mm

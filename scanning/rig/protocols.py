@@ -87,6 +87,8 @@ class OverlappingStage(Protocol):
     def move_to_while(self, steps: int, meanwhile: Callable[[], None]) -> None:
         """`Stage.move_to`, calling ``meanwhile`` once when the move is under way, or at once where there is none.
 
+        Before it sets out it makes sure that it stands where it was sent last; else it raises without ``meanwhile``.
+
         What ``meanwhile`` raises comes out when the stage stands still.
         """
         ...

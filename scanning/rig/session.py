@@ -346,10 +346,16 @@ class _Scan:
         self._hand_on(step, read, sink)
 
     def keep_last_step(self, sink: _Sink) -> None:
-        """Hand on a step that was exposed whole before something else failed. Moves nothing, takes nothing again."""
+        """Hand on a step that was exposed whole before something else failed. Moves nothing, takes nothing again.
+
+        An overlapping stage checks where it stands before it sets out again; until then a step's place is not certain.
+        """
         step, read = self._unread, self._read
         self._unread = self._read = None
         if step is None:
+            return
+        if read is None and isinstance(self.rig.stage, OverlappingStage):
+            log.warning("the frames of step %d are not kept: nothing vouches for the place they were taken at", step)
             return
         if read is None:
             read = self._read_out()

@@ -267,6 +267,18 @@ def test_a_step_that_was_exposed_whole_is_kept_when_the_next_move_fails(
     bed.assert_safe()
 
 
+def test_frames_taken_at_the_wrong_place_are_not_kept() -> None:
+    calls = Bed(OverlapCamera, OverlapStage)
+    calls.scan()
+    number = calls.tape.calls.index(f"set out to {START + 17 * 3}") + 1
+    fault = StageFault("The stage stands elsewhere.")
+    bed = Bed(OverlapCamera, OverlapStage, fail_at=number, fault=fault)  # what the check before setting out raises
+    with pytest.raises(StageFault, match="stands elsewhere"):
+        bed.scan()
+    assert [step for step, _ in bed.got] == [0, 1]
+    bed.assert_safe()
+
+
 @pytest.mark.parametrize("stage", [FakeStage, OverlapStage])
 def test_time_is_accounted_for(stage: type[FakeStage]) -> None:
     bed = Bed(OverlapCamera, stage)
