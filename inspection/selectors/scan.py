@@ -185,7 +185,7 @@ def time_budget(acquisition: dict[str, Any]) -> list[TimePart]:
     parts = {
         name.removesuffix("_s").replace("_", " "): float(seconds)
         for name, seconds in spent.items()
-        if name != "wall_s" and seconds > 0
+        if name not in ("wall_s", "overlapped_s") and seconds > 0  # the second is part of motion
     }
     total = sum(parts.values())
     ordered = sorted(parts.items(), key=lambda part: -part[1])

@@ -141,6 +141,10 @@ class GrblStage:
 
     def move_to(self, steps: int) -> None:
         """Move to ``steps`` from zero and return at standstill. Refuses positions outside the travel before moving."""
+        self.move_to_while(steps, _nothing)
+
+    def move_to_while(self, steps: int, meanwhile: Callable[[], None]) -> None:
+        """`move_to`, doing ``meanwhile`` on the way."""
         here = self.position_steps
         target_mm = steps * self.step_um / 1000
         if not -1e-9 <= target_mm <= self.travel_mm + 1e-9:
@@ -148,9 +152,11 @@ class GrblStage:
                 f"Position {target_mm:.3f} mm is outside the stage's travel of 0 to {self.travel_mm:g} mm; "
                 "move the region or the start of the scan."
             )
-        if steps == here:
-            return
         self.confirm()
+        if steps == here:
+            meanwhile()
+            return
+        on_the_way = _Once(meanwhile)
         self._count = None  # until it is proven to be there again
         machine_mm = self._zero_machine_mm + self._direction * target_mm
         feed = "" if self._feed_sent else f"F{self._feed_mm_min:.3f}"
@@ -159,7 +165,8 @@ class GrblStage:
         expected_s = _travel_time_s(distance_mm, self._feed_mm_min / 60, self.controller_settings[120])
         for attempt in range(1, ATTEMPTS + 1):
             last = attempt == ATTEMPTS
-            if self.link.attempt(lines, timeout_s=1.0 + 1.5 * expected_s, last=last) is not None:
+            sent = self.link.attempt(lines, timeout_s=1.0 + 1.5 * expected_s, last=last, meanwhile=on_the_way)
+            if sent is not None:
                 self.link.ask_status()
                 self._expected_machine_mm = machine_mm
                 break
@@ -172,6 +179,7 @@ class GrblStage:
                 )
         self._feed_sent = True
         self._count = steps
+        on_the_way.end()
 
     def confirm(self) -> None:
         """Check that the last move ended where it should: Idle, and at the place within the report's resolution."""
@@ -255,22 +263,15 @@ class GrblStage:
 
     def _read_settings(self) -> None:
         found = self.link.settings()
-        for number, value in self._wanted_settings.items():
+        self._check_settings(found | self._wanted_settings)  # before anything is written that cannot work
+        # Soft limits ($20) are refused while homing ($22) is off, so they come last.
+        for number, value in sorted(self._wanted_settings.items(), key=lambda item: (item[0] == 20, item[0])):
             if number not in found or abs(found[number] - value) > 0.001:
                 self.link.command(f"${number}={value:g}" if value == int(value) else f"${number}={value:.4f}")
         if self._wanted_settings:
             found = self.link.settings()
-        missing = [number for number in (100, 110, 120, 130) if number not in found]
-        if missing:
-            raise StageFault(
-                f"The controller on {self.link.port} does not tell its setting ${missing[0]}; "
-                "it does not speak GRBL 1.1: check the rig's controller."
-            )
+        self._check_settings(found)
         self.controller_settings = found
-        self._check_step(found)
-        self._feed_mm_min = min(self._wanted_feed or found[110], found[110])
-        if self._feed_mm_min < 1:
-            raise StageFault(f"The stage's feed is {self._feed_mm_min:g} mm/min; GRBL needs at least 1 mm/min.")
         homes_negative = bool(int(found.get(23, 0)) & 1)
         if self._zero == "homing":
             self._direction = 1 if homes_negative else -1
@@ -282,13 +283,33 @@ class GrblStage:
                 if len(sizes) >= 2:
                     self.link.rx_bytes = min(int(sizes[1]), 128)
 
-    def _check_step(self, found: Mapping[int, float]) -> None:
+    def _check_settings(self, found: Mapping[int, float]) -> None:
+        """Raise `StageFault` for settings that a scan cannot be made with; take feed and travel from them."""
         port = self.link.port
+        missing = [number for number in (100, 110, 120, 130) if number not in found]
+        if missing:
+            raise StageFault(
+                f"The controller on {port} does not tell its setting ${missing[0]}; "
+                "it does not speak GRBL 1.1: check the rig's controller."
+            )
+        impossible = [
+            number for number in (100, 110, 120, 130) if not (math.isfinite(found[number]) and found[number] > 0)
+        ]
+        if impossible:
+            raise StageFault(
+                f"The controller on {port} has ${impossible[0]} = {found[impossible[0]]:g}; set it above 0."
+            )
         rate = found[100] * found[110] / 60
         if rate > MAX_STEP_RATE_HZ:
             raise StageFault(
                 f"The controller on {port} is set to {rate:.0f} steps a second ($100 x $110 / 60), more than the "
                 f"{MAX_STEP_RATE_HZ} it can do; lower $110 to {int(MAX_STEP_RATE_HZ * 60 / found[100])} mm/min or less."
+            )
+        self._feed_mm_min = found[110] if self._wanted_feed is None else self._wanted_feed
+        if not 1 <= self._feed_mm_min <= found[110]:
+            raise StageFault(
+                f"The rig's feed is {self._feed_mm_min:g} mm/min but the controller on {port} moves at 1 to "
+                f"{found[110]:g} mm/min ($110); correct the rig's feed or $110."
             )
         usable = found[130] - (found.get(27, 0.0) if self._zero == "homing" else 0.0)
         self.travel_mm = usable if self._wanted_travel_mm is None else self._wanted_travel_mm
@@ -315,8 +336,6 @@ class GrblStage:
         self.link.command("G21 G90 G94 G17 G54")
         self.link.command("G92 X0", repeatable=True)
         status = self.link.status()
-        if status.machine_mm is None and status.work_mm is None:
-            raise StageFault(f"The controller on {self.link.port} reports no position; set $10=1 or $10=3.")
         self._zero_machine_mm = status.machine_mm if status.machine_mm is not None else 0.0
         self._count, self._zero_given = 0, True
 
@@ -350,10 +369,35 @@ class GrblStage:
             self.link.listen(POLL_S)
 
     def _is_at(self, status: Status, machine_mm: float) -> bool:
+        # What was reported is compared, not what was derived from an offset that only some reports carry.
         where = status.machine_mm
-        if where is None and status.work_mm is not None:
+        if "WPos" in status.fields and status.work_mm is not None:
             where = self._zero_machine_mm + status.work_mm
-        return where is None or abs(where - machine_mm) <= SANITY_MM
+        return where is not None and abs(where - machine_mm) <= SANITY_MM
+
+
+def _nothing() -> None:
+    pass
+
+
+class _Once:
+    """Calls ``act`` the first time only, and keeps what it raises until `end`: the move must be seen through."""
+
+    def __init__(self, act: Callable[[], None]) -> None:
+        self._act: Callable[[], None] | None = act
+        self._raised: Exception | None = None
+
+    def __call__(self) -> None:
+        act, self._act = self._act, None
+        if act is not None:
+            try:
+                act()
+            except Exception as fault:
+                self._raised = fault
+
+    def end(self) -> None:
+        if self._raised is not None:
+            raise self._raised
 
 
 class GrblLaser:

@@ -31,6 +31,12 @@ from scanning.rig.protocols import LinkQuality
 ANSWER_S = 2.0
 #: How long a controller may take from a reset to its greeting: Arduino bootloaders take 1.6 to 2 s.
 GREETING_S = 3.0
+#: How long to wait for the greeting after each reset that is sent, in seconds. A controller that is free greets in
+#: milliseconds; only one that did not heed the first reset gets a second.
+RESET_PATIENCE_S = (0.7, 0.7, GREETING_S)
+#: How long the answer to a question asked in passing may take, in seconds. The firmware answers in milliseconds; a busy
+#: host or a slow adapter may take longer, and that is no fault of the line.
+ASKED_S = 0.5
 #: Silence that means the controller has said all it had to say, in seconds.
 QUIET_S = 0.05
 #: Longest stretch of waiting before looking whether another thread called a halt, in seconds.
@@ -142,6 +148,24 @@ class GrblLink:
         finally:
             self._expecting_greeting = False
 
+    def _catches_up(self) -> bool:
+        """Whether the controller answers a status request, and with it everything it was asked before.
+
+        A slow board, or one in its bootloader, may greet twice: once for itself, once for the reset sent meanwhile. The
+        second greeting must not come in the middle of the talk that follows. What is heard before the answer is old.
+        """
+        self._expecting_greeting = True
+        try:
+            for _ in range(ATTEMPTS):
+                self.realtime(b"?")
+                deadline = self._clock() + ASKED_S
+                while (line := self._read_line(deadline)) is not None:
+                    if self._parse_status(line) is not None:
+                        return True
+            return False
+        finally:
+            self._expecting_greeting = False
+
     def _answers_status(self) -> bool:
         try:
             self.status(timeout_s=0.5)
@@ -153,10 +177,14 @@ class GrblLink:
         """Soft reset: laser off, planner empty, position lost if it moved. Returns when the controller is ready."""
         self._halted = None
         self._buffer.clear()
-        self.realtime(b"\x18")
-        greeted = self._await_greeting(GREETING_S)
+        # After a limit alarm the firmware spends half a second on its message and then forgets the resets of that time.
+        greeted = False
+        for patience in RESET_PATIENCE_S:
+            self.realtime(b"\x18")
+            if greeted := self._await_greeting(patience):
+                break
         self.drain()
-        if not greeted and not self._answers_status():
+        if not self._catches_up() and not greeted:
             raise StageFault(
                 f"The stage controller on {self.port} did not come back after a reset; switch it off and on."
             )
@@ -202,15 +230,18 @@ class GrblLink:
             "check its cable and supply, then home the stage."
         )
 
-    def attempt(self, lines: list[str], *, timeout_s: float, last: bool = False) -> list[str] | None:
+    def attempt(
+        self, lines: list[str], *, timeout_s: float, last: bool = False, meanwhile: Callable[[], None] | None = None
+    ) -> list[str] | None:
         """Send ``lines`` together and wait for all answers; None when noise ate one, so the caller may try again.
 
         ``timeout_s`` is the longest silence allowed between two answers. The ``last`` attempt takes a refusal at its
-        word. Raises `StageFault` for a refusal that correct lines can provoke, an alarm, a reset, a lost port.
+        word. ``meanwhile`` is called when the lines are out; it must not use this link. Raises `StageFault` for a
+        refusal that correct lines can provoke, an alarm, a reset, a lost port.
         """
         said: list[str] = []
         try:
-            self._send(lines, said, timeout_s)
+            self._send(lines, said, timeout_s, meanwhile)
         except _Refused as refusal:
             if last or refusal.number not in NOISE_ERRORS:
                 raise StageFault(f"Stage on {self.port}: {error_sentence(refusal.number)}.") from refusal
@@ -236,7 +267,9 @@ class GrblLink:
                 "check its cable and supply, then home the stage."
             ) from silence
 
-    def _send(self, lines: Iterable[str], said: list[str], timeout_s: float) -> None:
+    def _send(
+        self, lines: Iterable[str], said: list[str], timeout_s: float, meanwhile: Callable[[], None] | None = None
+    ) -> None:
         self._settle()
         self._unsettled = True
         waiting: deque[str] = deque()
@@ -251,6 +284,8 @@ class GrblLink:
             waiting.append(line)
             used += size
             self.max_outstanding_bytes = max(self.max_outstanding_bytes, used)
+        if meanwhile is not None:
+            meanwhile()
         while waiting:
             self._answered(waiting, said, timeout_s)
         self._unsettled = False
@@ -304,7 +339,7 @@ class GrblLink:
         if not self._asked:
             return None
         self._asked = False
-        deadline = self._clock() + 0.1
+        deadline = self._clock() + ASKED_S
         while (text := self._next(deadline)) is not None:
             if text.startswith("<"):
                 return self._parse_status(text)
@@ -389,6 +424,8 @@ class GrblLink:
             work = float(fields["WPos"].split(",")[0]) if "WPos" in fields else None
             free = int(fields["Bf"].split(",")[0]) if "Bf" in fields else None
         except ValueError:
+            return None
+        if machine is None and work is None:  # every report tells one of them; one without was damaged on its way
             return None
         if machine is None and work is not None and self._wco_mm is not None:
             machine = work + self._wco_mm

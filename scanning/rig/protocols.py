@@ -7,6 +7,7 @@ Every call either returns, or raises a `RigFault` within a time it owns. Nothing
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -77,6 +78,20 @@ class Stage(Protocol):
         ...
 
     def link_quality(self) -> LinkQuality: ...
+
+
+@runtime_checkable
+class OverlappingStage(Protocol):
+    """A stage that lets the host do something else on the way: the camera's frames are read out while it moves."""
+
+    def move_to_while(self, steps: int, meanwhile: Callable[[], None]) -> None:
+        """`Stage.move_to`, calling ``meanwhile`` once when the move is under way, or at once where there is none.
+
+        Before it sets out it makes sure that it stands where it was sent last; else it raises without ``meanwhile``.
+
+        What ``meanwhile`` raises comes out when the stage stands still.
+        """
+        ...
 
 
 class Laser(Protocol):

@@ -19,8 +19,10 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from scanning.errors import BadInput
+from scanning.rig.gentl import GenTLCamera
 from scanning.rig.grbl import GrblLaser, GrblStage
 from scanning.rig.protocols import Camera, Laser, Stage
+from scanning.rig.pylon import PylonCamera
 from scanning.rig.simulated.camera import SimulatedCamera
 
 log = logging.getLogger(__name__)
@@ -52,6 +54,8 @@ def _grbl(options: Mapping[str, Any]) -> GrblStage:
 STAGES: dict[str, tuple[Callable[..., Stage], Callable[[Mapping[str, Any]], Stage]]] = {"grbl": (GrblStage, _grbl)}
 CAMERAS: dict[str, tuple[Callable[..., Camera], Callable[[Mapping[str, Any]], Camera]]] = {
     "simulated": (SimulatedCamera, lambda options: SimulatedCamera(**options)),
+    "pylon": (PylonCamera, lambda options: PylonCamera(**options)),
+    "gentl": (GenTLCamera, lambda options: GenTLCamera(**options)),
 }
 
 

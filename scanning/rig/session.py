@@ -22,7 +22,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from scanning.errors import BadInput, CameraFault, RigFault, Stopped
-from scanning.rig.protocols import Frame, LinkQuality, OverlappingCamera, SensorMode
+from scanning.rig.protocols import Frame, LinkQuality, OverlappingCamera, OverlappingStage, SensorMode
 from scanning.rig.rig import Rig
 
 log = logging.getLogger(__name__)
@@ -107,7 +107,8 @@ class TimeBudget:
     """Where the time of a scan went, in seconds of wall clock; ``software_s`` is what is left of ``wall_s``.
 
     ``exposure_s`` holds what the sensor makes exposures wait for each other; ``setup_s`` is the configuration of the
-    camera and the dark frame, ``parking_s`` everything after the last frame.
+    camera and the dark frame, ``parking_s`` everything after the last frame. ``readout_s`` is the read-out that was
+    waited for; what was read out while the stage moved is part of ``motion_s`` and told beside it by ``overlapped_s``.
     """
 
     wall_s: float = 0.0
@@ -120,10 +121,11 @@ class TimeBudget:
     sink_wait_s: float = 0.0
     paused_s: float = 0.0
     parking_s: float = 0.0
+    overlapped_s: float = 0.0
 
     @property
     def software_s(self) -> float:
-        known: float = sum(value for name, value in vars(self).items() if name != "wall_s")
+        known: float = sum(value for name, value in vars(self).items() if name not in ("wall_s", "overlapped_s"))
         return max(self.wall_s - known, 0.0)
 
     @property
@@ -179,6 +181,7 @@ def acquire(
         ended = clock.monotonic()
         # The light goes out before anything is waited for.
         failure = _attempt(failure, lambda: _darken(rig), "switch the laser off")
+        failure = _attempt(failure, lambda: scan.keep_last_step(sink), "keep the frames of the last step")
         failure = _attempt(failure, lambda: _park(rig), "park the stage")
         failure = _attempt(failure, sink.finish, "hand on the last frames")
         scan.summary.time.parking_s = clock.monotonic() - ended
@@ -240,7 +243,8 @@ class _Scan:
         self.rig, self.plan, self.control, self.clock = rig, plan, control, clock
         self.summary = AcquisitionSummary(steps_done=plan.first_step)
         self._last_id: int | None = None
-        self._unread: tuple[int, list[Frame]] | None = None  # a step whose last frame is still in the camera
+        self._unread: int | None = None  # a step whose frames are still in the camera
+        self._read: list[Frame] | CameraFault | None = None  # what reading it out on the way gave
         self._retakes_left = max(1, int(plan.steps * RETAKE_SHARE))
 
     def run(self, sink: _Sink) -> None:
@@ -264,12 +268,20 @@ class _Scan:
                 if order == "finish":
                     self.summary.finished_early = True
                     break
-            with _Stopwatch(self.clock, spent, "motion_s"):
-                self.rig.stage.move_to(plan.position_steps(step, self.rig))
+            self._move_on(step)
             self._collect(sink)
             self._expose(step, sink)
             step += 1
         self._collect(sink)
+
+    def _move_on(self, step: int) -> None:
+        """Go to ``step``, reading out the frames of the step before on the way where the stage allows it."""
+        stage, position = self.rig.stage, self.plan.position_steps(step, self.rig)
+        with _Stopwatch(self.clock, self.summary.time, "motion_s"):
+            if isinstance(stage, OverlappingStage):
+                stage.move_to_while(position, self._read_out_on_the_way)
+            else:
+                stage.move_to(position)
 
     def _take_place(self, step: int) -> None:
         """Home, go to the approach side of ``step``, and only then light up."""
@@ -307,7 +319,7 @@ class _Scan:
                 with _Stopwatch(self.clock, spent, "exposure_s"):
                     for exposure_us in plan.exposures_us:
                         camera.expose(exposure_us, timeout_s=plan.frame_timeout_s)
-                self._unread = (step, [])
+                self._unread = step
             else:
                 with _Stopwatch(self.clock, spent, "exposure_s"):
                     frames = [self._checked(self._grab(e), e) for e in plan.exposures_us]
@@ -319,23 +331,55 @@ class _Scan:
         """Read out the step the camera still holds; the stage may have moved on meanwhile."""
         if self._unread is None:
             return
-        step, _ = self._unread
-        self._unread = None
-        camera, plan = self.rig.camera, self.plan
-        assert isinstance(camera, OverlappingCamera)
-        frames: list[Frame] = []
-        try:
+        step, read = self._unread, self._read
+        self._unread = self._read = None
+        if read is None:
             with _Stopwatch(self.clock, self.summary.time, "readout_s"):
-                for exposure_us in plan.exposures_us:
-                    frames.append(self._checked(camera.read_out(timeout_s=plan.frame_timeout_s), exposure_us))
-        except CameraFault as fault:
+                read = self._read_out()
+        if isinstance(read, CameraFault):
             here = self.rig.stage.position_steps
-            self._retake(step, fault, sink)
+            self._retake(step, read, sink)
             if here != self.rig.stage.position_steps:
                 with _Stopwatch(self.clock, self.summary.time, "motion_s"):
                     self.rig.stage.move_to(here)
             return
-        self._hand_on(step, frames, sink)
+        self._hand_on(step, read, sink)
+
+    def keep_last_step(self, sink: _Sink) -> None:
+        """Hand on a step that was exposed whole before something else failed. Moves nothing, takes nothing again.
+
+        An overlapping stage checks where it stands before it sets out again; until then a step's place is not certain.
+        """
+        step, read = self._unread, self._read
+        self._unread = self._read = None
+        if step is None:
+            return
+        if read is None and isinstance(self.rig.stage, OverlappingStage):
+            log.warning("the frames of step %d are not kept: nothing vouches for the place they were taken at", step)
+            return
+        if read is None:
+            read = self._read_out()
+        if isinstance(read, CameraFault):
+            log.warning("the frames of step %d are lost: %s", step, read)
+            return
+        self._hand_on(step, read, sink)
+
+    def _read_out_on_the_way(self) -> None:
+        if self._unread is not None:
+            with _Stopwatch(self.clock, self.summary.time, "overlapped_s"):
+                self._read = self._read_out()
+
+    def _read_out(self) -> list[Frame] | CameraFault:
+        """The bracket that the camera holds, or why it cannot be trusted. Moves nothing."""
+        camera, plan = self.rig.camera, self.plan
+        assert isinstance(camera, OverlappingCamera)
+        try:
+            return [
+                self._checked(camera.read_out(timeout_s=plan.frame_timeout_s), exposure_us)
+                for exposure_us in plan.exposures_us
+            ]
+        except CameraFault as fault:
+            return fault
 
     def _retake(self, step: int, fault: CameraFault, sink: _Sink) -> None:
         """Take a step's bracket once more, at its own place reached from its own side."""

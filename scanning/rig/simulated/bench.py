@@ -229,8 +229,10 @@ class Bench:
                 act()
         elif fault == "garbage":
             c.faults.garbage = str(options.get("text", "\xff\xfe#")).encode("latin-1")
-        elif fault in ("drop_to_host", "drop_to_controller"):
-            setattr(c.faults, fault, int(options.get("count", 1)))
+        elif fault == "drop_to_host":
+            c.line.drop_out = int(options.get("count", 1))
+        elif fault == "drop_to_controller":
+            c.line.drop_in = int(options.get("count", 1))
         elif fault in ("mute", "unmute"):
             c.faults.mute = fault == "mute"
         elif fault == "dead_switch":

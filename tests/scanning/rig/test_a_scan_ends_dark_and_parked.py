@@ -6,6 +6,7 @@ The heart is `test_whatever_raises_wherever`: a fault injected at every single h
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -87,6 +88,15 @@ class FakeStage:
         return LinkQuality(lines_sent=7)
 
 
+class OverlapStage(FakeStage):
+    """Lets the frames be read out on its way."""
+
+    def move_to_while(self, steps: int, meanwhile: Callable[[], None]) -> None:
+        self.tape.note(f"set out to {steps}")
+        meanwhile()
+        self.move_to(steps)
+
+
 class FakeLaser:
     def __init__(self, tape: Tape) -> None:
         self.tape, self.lit = tape, False
@@ -159,9 +169,11 @@ class Orders:
 
 
 class Bed:
-    def __init__(self, camera: type[FakeCamera] = OverlapCamera, **tape: Any) -> None:
+    def __init__(
+        self, camera: type[FakeCamera] = OverlapCamera, stage: type[FakeStage] = FakeStage, **tape: Any
+    ) -> None:
         self.tape, self.clock = Tape(**tape), FakeClock()
-        self.stage = FakeStage(self.tape, self.clock)
+        self.stage = stage(self.tape, self.clock)
         self.laser = FakeLaser(self.tape)
         self.camera = camera(self.tape, self.stage, self.laser)
         self.rig = Rig(self.stage, self.laser, self.camera, "Rig 1", warm_up_s=0.2)
@@ -179,9 +191,18 @@ class Bed:
         assert not [t for t in threading.enumerate() if t.name == "frame-sink" and t.is_alive()]
 
 
-@pytest.fixture(params=[FakeCamera, OverlapCamera], ids=["plain", "overlapping"])
+#: Camera and stage that can or cannot let one thing happen beside another.
+ABILITIES = [
+    (FakeCamera, FakeStage),
+    (OverlapCamera, FakeStage),
+    (FakeCamera, OverlapStage),
+    (OverlapCamera, OverlapStage),
+]
+
+
+@pytest.fixture(params=ABILITIES, ids=["plain", "camera overlaps", "stage overlaps", "both overlap"])
 def bed(request: pytest.FixtureRequest) -> Bed:
-    return Bed(request.param)
+    return Bed(*request.param)
 
 
 def test_a_scan_hands_on_every_step_with_its_bracket_in_order(bed: Bed) -> None:
@@ -219,8 +240,48 @@ def test_the_stage_moves_on_before_the_frames_are_read_out() -> None:
     ]  # fmt: skip
 
 
-def test_time_is_accounted_for() -> None:
-    bed = Bed(OverlapCamera)
+def test_frames_are_read_out_while_the_stage_is_on_its_way() -> None:
+    bed = Bed(OverlapCamera, OverlapStage)
+    bed.scan(replace(PLAN, steps=2))
+    at = bed.tape.calls.index(f"set out to {START}")
+    assert bed.tape.calls[at:-2] == [
+        f"set out to {START}", f"move {START}", "expose 100", "expose 300",
+        f"set out to {START + 17}", "read out", "read out", f"move {START + 17}", "expose 100", "expose 300",
+        "read out", "read out",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("camera", "stage"), ABILITIES)
+def test_a_step_that_was_exposed_whole_is_kept_when_the_next_move_fails(
+    camera: type[FakeCamera], stage: type[FakeStage]
+) -> None:
+    calls = Bed(camera, stage)
+    calls.scan()
+    number = calls.tape.calls.index(f"move {START + 17 * 3}") + 1
+    bed = Bed(camera, stage, fail_at=number)
+    with pytest.raises(StageFault, match="the stage broke"):
+        bed.scan()
+    assert [step for step, _ in bed.got] == [0, 1, 2]
+    assert all([f.exposure_us for f in frames] == [100.0, 300.0] for _, frames in bed.got)
+    assert all(frame.image.max() == 100 for _, frames in bed.got for frame in frames)
+    bed.assert_safe()
+
+
+def test_frames_taken_at_the_wrong_place_are_not_kept() -> None:
+    calls = Bed(OverlapCamera, OverlapStage)
+    calls.scan()
+    number = calls.tape.calls.index(f"set out to {START + 17 * 3}") + 1
+    fault = StageFault("The stage stands elsewhere.")
+    bed = Bed(OverlapCamera, OverlapStage, fail_at=number, fault=fault)  # what the check before setting out raises
+    with pytest.raises(StageFault, match="stands elsewhere"):
+        bed.scan()
+    assert [step for step, _ in bed.got] == [0, 1]
+    bed.assert_safe()
+
+
+@pytest.mark.parametrize("stage", [FakeStage, OverlapStage])
+def test_time_is_accounted_for(stage: type[FakeStage]) -> None:
+    bed = Bed(OverlapCamera, stage)
     time = bed.scan(replace(PLAN, settle_s=0.005)).time
     assert time.motion_s == pytest.approx(6 * 0.02)
     assert time.settle_s == pytest.approx(6 * 0.005)
@@ -250,7 +311,7 @@ def test_finish_early_is_a_good_end(bed: Bed) -> None:
 
 def test_pause_goes_dark_and_parks_then_rehomes_and_continues_at_the_exact_step(bed: Bed) -> None:
     summary = bed.scan(control=Orders(at3="pause", at4="pause", at5="pause"))
-    calls = bed.tape.calls
+    calls = [call for call in bed.tape.calls if not call.startswith("set out")]
     at = calls.index("park")
     assert calls[at - 1] == "laser off"
     assert calls[at + 1 : at + 4] == ["home", f"move {START + 2 * 17 - 204}", "laser on"]
@@ -283,8 +344,8 @@ def test_it_continues_where_an_interrupted_scan_ended(bed: Bed) -> None:
 # ---- safety -----------------------------------------------------------------------------------------------------
 
 
-def calls_of_a_whole_scan(camera: type[FakeCamera]) -> list[str]:
-    bed = Bed(camera)
+def calls_of_a_whole_scan(camera: type[FakeCamera], stage: type[FakeStage]) -> list[str]:
+    bed = Bed(camera, stage)
     bed.scan(replace(PLAN, steps=3), control=Orders(at2="pause", at3="run"))
     return bed.tape.calls
 
@@ -295,12 +356,12 @@ FAULTS: list[BaseException] = [
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: type(fault).__name__)
-@pytest.mark.parametrize("camera", [FakeCamera, OverlapCamera])
-def test_whatever_raises_wherever(camera: type[FakeCamera], fault: BaseException) -> None:
+@pytest.mark.parametrize(("camera", "stage"), ABILITIES)
+def test_whatever_raises_wherever(camera: type[FakeCamera], stage: type[FakeStage], fault: BaseException) -> None:
     """One fault at each call of a scan with a pause in it, cleanup included: always dark, and parked if it can be."""
-    expected = calls_of_a_whole_scan(camera)
+    expected = calls_of_a_whole_scan(camera, stage)
     for number, call in enumerate(expected, start=1):
-        bed = Bed(camera, fail_at=number, fault=fault)
+        bed = Bed(camera, stage, fail_at=number, fault=fault)
         in_bracket = call.split()[0] in ("expose", "read") or (call.startswith("grab") and number > 3)
         retaken = isinstance(fault, CameraFault) and in_bracket
         if retaken:

@@ -3,6 +3,7 @@ to do, with the laser dark, or is repaired and counted in the link quality. Afte
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 
 import pytest
@@ -125,6 +126,64 @@ def test_a_line_that_lands_elsewhere_is_noticed(lit: GrblStage, bench: Bench) ->
     lit._expected_machine_mm = lit._zero_machine_mm + 5 * 0.00833
     with pytest.raises(StageFault, match=r"stands at .* mm instead of .*; check the serial line"):
         lit.confirm()
+
+
+def test_a_report_without_a_position_vouches_for_nothing(
+    lit: GrblStage, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Found with the real firmware on a bad cable: one lost letter of MPos, and 0.35 mm went unnoticed."""
+    lit.confirm()
+    say = bench.controller._say
+    spoiled: list[str] = []
+
+    def spoil(text: str) -> None:
+        if text.startswith("<Idle") and not spoiled:
+            spoiled.append(text)
+            text = text.replace("MPos", "Mos")
+        say(text)
+
+    monkeypatch.setattr(bench.controller, "_say", spoil)
+    lit.link.command("G1X0.5000")  # stands for a move whose digits were changed on their way
+    lit._expected_machine_mm = lit._zero_machine_mm + 5 * 0.00833
+    lit.link.ask_status()
+    with pytest.raises(StageFault, match=r"stands at .* mm instead of .*; check the serial line"):
+        lit.confirm()
+    assert spoiled
+
+
+def test_a_board_that_greets_once_more_while_it_is_being_opened(
+    make_bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A slow board greets for itself and again for the reset that was sent meanwhile; neither is a restart."""
+    bench = make_bench(speed_up=1.0)
+    bench.clock.speed_up = 40.0
+    controller = bench.controller
+    greet = controller._greet
+
+    def late() -> None:
+        greet()
+        controller.line._out_free += 5.0  # machine time: an eighth of a second
+        greet()
+
+    monkeypatch.setattr(controller, "_greet", late)
+    stage = GrblStage(bench.port, travel_mm=100.0)
+    stage.open()
+    assert stage.link.quality.resets == 0
+    monkeypatch.setattr(controller, "_greet", greet)
+    stage.home()
+    stage.close()
+
+
+def test_a_controller_that_stalls_for_a_while_and_goes_on(lit: GrblStage, bench: Bench) -> None:
+    lit.confirm()
+    bench.provoke("stage", "mute")
+    awake = threading.Timer(0.3, lambda: bench.provoke("stage", "unmute"))
+    awake.start()
+    scan_on(lit)
+    awake.join()
+    assert round(bench.state()["position_um"] / STEP_UM) == lit.position_steps == 17 * 10
+    assert lit.link_quality().retries > 0
+    assert laser_of(bench) == 1.0
 
 
 def test_somebody_presses_hold_at_the_machine(lit: GrblStage, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -83,6 +83,30 @@ def test_a_controller_that_is_set_up_wrongly(
     assert not stage.link.is_open
 
 
+@pytest.mark.parametrize(
+    ("wanted", "sentence"),
+    [
+        ({110: 1000.0}, r"34014 steps a second .* lower \$110 to 882 mm/min"),
+        ({120: 0.0}, r"\$120 = 0; set it above 0"),
+        ({110: -5.0}, r"\$110 = -5; set it above 0"),
+    ],
+)
+def test_settings_that_cannot_work_are_never_written(
+    make_bench: Callable[..., Bench], wanted: dict[int, float], sentence: str
+) -> None:
+    bench = make_bench()
+    before = dict(bench.controller.settings)
+    with pytest.raises(StageFault, match=sentence):
+        GrblStage(bench.port, travel_mm=100.0, settings={1: 254, **wanted}).open()
+    assert bench.controller.settings == before
+
+
+@pytest.mark.parametrize("feed", [0.0, 0.5, 721.0, float("nan")])
+def test_a_feed_that_the_controller_does_not_make(make_bench: Callable[..., Bench], feed: float) -> None:
+    with pytest.raises(StageFault, match=r"moves at 1 to 720 mm/min \(\$110\); correct the rig's feed or \$110"):
+        GrblStage(make_bench().port, travel_mm=100.0, feed_mm_min=feed).open()
+
+
 def test_moving_before_homing(make_bench: Callable[..., Bench]) -> None:
     bench = make_bench()
     stage = GrblStage(bench.port)
