@@ -12,6 +12,7 @@ Source: Amir and Thornberg 2017, section 4.5 and Table 2; ordinary least squares
 from __future__ import annotations
 
 import csv
+import datetime as dt
 import hashlib
 import io
 import json
@@ -19,7 +20,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,6 +31,9 @@ FORMAT = "edgewatch-calibration/1"
 FEWEST_PAIRS = 3
 STEEPEST_MM_PER_PX = 10.0
 """As for a stack's mm_per_pixel: heights written in um give 14 on IS1 and would pass for a good line."""
+DUE_DAYS = 30
+"""A calibration that expires within so many days is due."""
+State = Literal["valid", "due", "expired", "without expiry"]
 HEIGHT = "height_mm"
 COLUMN = "column_px"
 
@@ -51,6 +55,12 @@ class LineFit:
     r_squared: float
     residuals: NDArray[np.float64]
     leverage: NDArray[np.float64]
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """Covariance of (intercept, slope), (2, 2), in the units of y, and y per x."""
+        mixed = self.correlation * self.u_intercept * self.u_slope
+        return np.array([[self.u_intercept**2, mixed], [mixed, self.u_slope**2]])
 
     @property
     def leave_one_out(self) -> NDArray[np.float64]:
@@ -126,6 +136,23 @@ class Calibration:
         return min(self.heights_mm), max(self.heights_mm)
 
     @property
+    def covariance(self) -> NDArray[np.float64]:
+        """Covariance of (intercept, slope), (2, 2): mm2, mm2 per px, mm2 per px2."""
+        mixed = self.correlation * self.u_intercept_mm * self.u_slope_mm_per_px
+        return np.array([[self.u_intercept_mm**2, mixed], [mixed, self.u_slope_mm_per_px**2]])
+
+    def standing(self, on: dt.date) -> tuple[State, str]:
+        """Whether the calibration holds on a day, and the sentence that says so. The last day still counts."""
+        if self.expires_on is None:
+            return "without expiry", "The calibration has no expiry date; calibrate with one."
+        left = (dt.date.fromisoformat(self.expires_on) - on).days
+        if left < 0:
+            return "expired", f"The calibration expired on {self.expires_on}, {-left} days ago; calibrate again."
+        if left <= DUE_DAYS:
+            return "due", f"The calibration expires on {self.expires_on}, in {left} days."
+        return "valid", f"The calibration is valid until {self.expires_on}."
+
+    @property
     def u_slope_relative(self) -> float:
         """u(slope) / |slope|, without unit."""
         return self.u_slope_mm_per_px / abs(self.slope_mm_per_px)
@@ -165,6 +192,7 @@ class Calibration:
             "model": "straight line, height on pixel",
             "pairs": self.pairs,
             **{name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()},
+            "covariance": self.covariance.tolist(),
             "u_slope_percent": 100.0 * self.u_slope_relative,
             "calibrated_range_px": list(self.range_px),
             "calibrated_range_mm": list(self.range_mm),
@@ -186,8 +214,8 @@ class Calibration:
             heights,
             columns,
             gauge=str(stored.get("gauge") or ""),
-            measured_on=stored.get("measured_on"),
-            expires_on=stored.get("expires_on"),
+            measured_on=_text_or_none(stored.get("measured_on")),
+            expires_on=_text_or_none(stored.get("expires_on")),
             where=where,
         )
         if not math.isclose(calibration.slope_mm_per_px, slope, rel_tol=1e-9):
@@ -215,8 +243,14 @@ def calibrate(
 ) -> Calibration:
     """Fit height on pixel through gauge pairs. ``where`` names their origin in the sentence of a `BadInput`.
 
-    Refused: fewer than three pairs, values that are not finite, fewer than three different columns or heights.
+    Refused: fewer than three pairs, values that are not finite, fewer than three different columns or heights, dates
+    that are no ISO dates (2026-11-24) or an expiry before the measurement.
     """
+    measured, expires = _day(measured_on, "measured_on", where), _day(expires_on, "expires_on", where)
+    if measured is not None and expires is not None and expires < measured:
+        raise BadInput(
+            f"{where}: it would expire on {expires}, before it was measured on {measured}; correct the dates"
+        )
     if len(heights_mm) != len(columns_px):
         raise BadInput(f"{where}: {len(heights_mm)} heights but {len(columns_px)} columns; give one column per height")
     if len(heights_mm) < FEWEST_PAIRS:
@@ -263,6 +297,19 @@ def calibrate(
         measured_on=measured_on,
         expires_on=expires_on,
     )
+
+
+def _text_or_none(stored: object) -> str | None:
+    return None if stored is None else str(stored)
+
+
+def _day(written: str | None, what: str, where: str) -> dt.date | None:
+    if written is None:
+        return None
+    try:
+        return dt.date.fromisoformat(written)
+    except ValueError:
+        raise BadInput(f'{where}: {what} is "{written}", not a date; write it as 2026-11-24') from None
 
 
 def read_pairs(text: str, where: str = "the gauge pairs") -> tuple[list[float], list[float]]:
