@@ -36,7 +36,7 @@ Direction = Literal["rows", "profiles"]
 LEAST_STEP_PX = 1.0
 FEWEST_PLACES = 8
 FEWEST_PIXELS = 30
-SURE = 7.0
+SURE = 5.5
 """A wall stands out of the noise of the medians by so many standard deviations."""
 GUARD_ROWS = 3
 DIAGONAL_STEPS = 7
@@ -48,8 +48,9 @@ ASKEW = 0.001
 """A common slope is taken out when chance alone would give it with less than this probability."""
 FLAT = 0.1
 """Treads may bend by this share of the smallest step between neighbours, beyond what noise explains."""
-NOISE_OF_THIRDS = 7.0
-"""The range of three medians of a third each, in uncertainties of the whole tread's mean: 4 standard deviations."""
+NOISE_OF_THIRDS = 8.0
+"""How far noise moves the medians of the thirds of a tread apart: in noise of a place over root of the places, with
+room for grains of speckle that span four places."""
 BLOCK = 10
 """Side of the blocks whose scatter gives uncertainties, pixels: larger than speckle and than an SCI window."""
 _MAD = 1.4826
@@ -151,8 +152,8 @@ def find_gauge(image: RangeImage, um_per_px: float | None = None) -> Gauge:
             best = explained, gauge
     if best is None and bend > FLAT:
         raise BadInput(
-            f"what lies between the walls is not flat (it bends by {100 * bend:.0f} % of a step), so these are no treads "
-            "of a step gauge; scan the gauge, or a cleaner part of it"
+            f"what lies between the walls is not flat (it bends by {100 * bend:.0f} % of a step), so these are no "
+            "treads of a step gauge; scan the gauge, or a cleaner part of it"
         )
     if best is None:
         seen = int(np.count_nonzero(np.isfinite(column)))
@@ -173,7 +174,8 @@ def _bend(values: Float64, gauge: Gauge) -> float:
         level = values[rows] - (gauge.askew_px * (rows - tread.middle))[:, None]
         parts = [part[np.isfinite(part)] for part in np.array_split(level, 3)]
         medians = [float(np.median(part)) for part in parts if part.size]
-        noise = 0.0 if math.isnan(tread.u_column_px) else NOISE_OF_THIRDS * tread.u_column_px
+        places = np.array([float(np.median(one[np.isfinite(one)])) for one in level if np.isfinite(one).any()])
+        noise = NOISE_OF_THIRDS * _noise(places) / math.sqrt(rows.size / 3.0)
         worst = max(worst, max(medians) - min(medians) - noise)
     return worst / step if step > 0 else math.inf
 
@@ -259,8 +261,7 @@ def _spans(values: Float64, guard: int) -> list[tuple[int, int]]:
 
 def _walls(level: Float64) -> list[int]:
     """Indices k where level[:k] and level[k:] lie on different treads."""
-    differences = np.diff(level)
-    noise = _MAD * float(np.median(np.abs(differences))) / math.sqrt(2.0)
+    noise = _noise(level)
     reach = min(REACH, max(2, level.size // 4))
     jump = np.zeros(level.size)
     for k in range(2, level.size - 1):
@@ -279,6 +280,11 @@ def _walls(level: Float64) -> list[int]:
         at = int(near[np.argmax(np.sign(jump[k]) * (level[near] - level[near - 1]))])
         walls.append(at)
         size[max(0, at - reach) : at + reach + 1] = 0.0
+
+
+def _noise(level: Float64) -> float:
+    """Standard deviation of one place, from the differences between neighbours."""
+    return _MAD * float(np.median(np.abs(np.diff(level)))) / math.sqrt(2.0) if level.size > 1 else 0.0
 
 
 def _joined(spans: list[tuple[int, int]], level: Float64, places: NDArray[np.int64]) -> list[tuple[int, int]]:

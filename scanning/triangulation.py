@@ -113,8 +113,8 @@ def compare_models(calibration: Calibration, triangulation: Triangulation) -> Co
     system = triangulation.system
     if system.stand_off_mm is None or system.focal_length_mm is None:
         raise BadInput(
-            f"eq. (1) needs the stand-off and the focal length of {system.name}, which are not known; compare with IS1 or "
-            "leave the comparison out"
+            f"eq. (1) needs the stand-off and the focal length of {system.name}, which are not known; compare with "
+            "IS1 or leave the comparison out"
         )
     columns = np.asarray(calibration.columns_px)
     heights = np.asarray(calibration.heights_mm)
