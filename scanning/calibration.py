@@ -102,7 +102,8 @@ class Calibration:
     ``heights_mm`` and ``columns_px`` are the gauge pairs in the order given; ``residuals_um`` and
     ``leave_one_out_each_um`` belong to them one by one. ``leave_one_out_um`` is the LARGEST absolute leave-one-out
     error (14.0 um for the paper's IS1, 28.4 um for IS2), as ``max_residual_um`` is the largest absolute residual.
-    ``measured_on`` and ``expires_on`` are ISO dates or None.
+    ``measured_on`` and ``expires_on`` are ISO dates or None. ``u_scale_relative`` is what stretches all heights alike
+    and so leaves no residual: how sure the gauge's tilt is known, its certificate.
     """
 
     heights_mm: tuple[float, ...]
@@ -121,6 +122,7 @@ class Calibration:
     gauge: str = ""
     measured_on: str | None = None
     expires_on: str | None = None
+    u_scale_relative: float = 0.0
 
     @property
     def pairs(self) -> int:
@@ -154,8 +156,8 @@ class Calibration:
 
     @property
     def u_slope_relative(self) -> float:
-        """u(slope) / |slope|, without unit."""
-        return self.u_slope_mm_per_px / abs(self.slope_mm_per_px)
+        """u(slope) / |slope|, without unit: of the line, and of the gauge's scale as a whole."""
+        return math.hypot(self.u_slope_mm_per_px / abs(self.slope_mm_per_px), self.u_scale_relative)
 
     def height_um(self, column_px: ArrayLike) -> NDArray[np.float64]:
         """Height in um of a line seen at ``column_px`` (0-based columns, any shape). NaN stays NaN."""
@@ -208,6 +210,7 @@ class Calibration:
             heights = [float(value) for value in stored["heights_mm"]]
             columns = [float(value) for value in stored["columns_px"]]
             slope = float(stored["slope_mm_per_px"])
+            u_scale = float(stored.get("u_scale_relative", 0.0))
         except (KeyError, TypeError, ValueError) as error:
             raise BadInput(f"{where} lacks or garbles {error}; write it again with calibrate") from error
         calibration = calibrate(
@@ -216,6 +219,7 @@ class Calibration:
             gauge=str(stored.get("gauge") or ""),
             measured_on=_text_or_none(stored.get("measured_on")),
             expires_on=_text_or_none(stored.get("expires_on")),
+            u_scale_relative=u_scale,
             where=where,
         )
         if not math.isclose(calibration.slope_mm_per_px, slope, rel_tol=1e-9):
@@ -227,7 +231,8 @@ class Calibration:
 
     def sha256(self) -> str:
         """Identity of the calibration: the hash of what it was made from, not of figures that a CPU may round."""
-        origin = [FORMAT, self.heights_mm, self.columns_px, self.gauge, self.measured_on, self.expires_on]
+        origin: list[Any] = [FORMAT, self.heights_mm, self.columns_px, self.gauge, self.measured_on, self.expires_on]
+        origin += [self.u_scale_relative] if self.u_scale_relative else []
         told = json.dumps(origin, separators=(",", ":"), allow_nan=False)
         return hashlib.sha256(told.encode()).hexdigest()
 
@@ -239,6 +244,7 @@ def calibrate(
     gauge: str = "",
     measured_on: str | None = None,
     expires_on: str | None = None,
+    u_scale_relative: float = 0.0,
     where: str = "the gauge pairs",
 ) -> Calibration:
     """Fit height on pixel through gauge pairs. ``where`` names their origin in the sentence of a `BadInput`.
@@ -246,6 +252,8 @@ def calibrate(
     Refused: fewer than three pairs, values that are not finite, fewer than three different columns or heights, dates
     that are no ISO dates (2026-11-24) or an expiry before the measurement.
     """
+    if not (math.isfinite(u_scale_relative) and u_scale_relative >= 0.0):
+        raise BadInput(f"{where}: u_scale_relative is {u_scale_relative}, not a number from 0 upwards; calibrate again")
     measured, expires = _day(measured_on, "measured_on", where), _day(expires_on, "expires_on", where)
     if measured is not None and expires is not None and expires < measured:
         raise BadInput(
@@ -296,6 +304,7 @@ def calibrate(
         gauge=gauge,
         measured_on=measured_on,
         expires_on=expires_on,
+        u_scale_relative=u_scale_relative,
     )
 
 

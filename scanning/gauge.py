@@ -106,6 +106,13 @@ class Gauge:
         """What the slope's uncertainty still allows the first and the last tread to be apart, in px."""
         return self.u_askew_px * abs(self.treads[-1].middle - self.treads[0].middle)
 
+    @property
+    def u_scale_relative(self) -> float:
+        """What the slope's uncertainty allows the whole scale to be wrong by, as a share."""
+        columns = [t.column_px for t in self.treads]
+        u = self.u_from_askew_px / (max(columns) - min(columns))
+        return u if math.isfinite(u) else 0.0
+
     def to_json(self) -> dict[str, Any]:
         return {
             "direction": self.direction,

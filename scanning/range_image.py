@@ -56,17 +56,37 @@ class RangeImage:
         return self.undefined / self.height_um.size if self.height_um.size else 1.0
 
     @property
+    def outside_calibrated(self) -> NDArray[np.bool_] | None:
+        """(rows, profiles) True where a height is extrapolated: its column lies beyond the gauge's.
+
+        None when the heights are not from a gauge (the stack header's mm per pixel), or its range is not told.
+        """
+        calibration = self.provenance.get("calibration")
+        span = calibration.get("calibrated_range_px") if isinstance(calibration, dict) else None
+        if not isinstance(span, (list, tuple)) or len(span) != 2:
+            return None
+        # float32, as columns are kept: a tread's own column must not fall outside by its rounding.
+        low, high = np.float32(span[0]), np.float32(span[1])
+        finite = np.isfinite(self.height_um)
+        return np.asarray(finite & ~((self.column_px >= low) & (self.column_px <= high)), dtype=np.bool_)
+
+    @property
     def saturated_share(self) -> float:
         return self.saturated / self.frame_pixels if self.frame_pixels else 0.0
 
     def save(self, path: Path | str) -> None:
         """Write ``range.npz`` (contract 3): the arrays as float32, both pitches, counts, and provenance as JSON text.
 
+        With a calibration also ``outside_calibrated`` (bool), for those who read the file with other software.
+
         The file appears whole or not at all.
         """
+        outside = self.outside_calibrated
+        flags: dict[str, Any] = {} if outside is None else {"outside_calibrated": outside}
         with whole_file(path) as part, part.open("wb") as file:
             np.savez(
                 file,
+                **flags,
                 column_px=self.column_px.astype(np.float32, copy=False),
                 height_um=self.height_um.astype(np.float32, copy=False),
                 row_pitch_um=np.float64(self.row_pitch_um),
