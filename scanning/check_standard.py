@@ -90,7 +90,7 @@ def measure_step(
     reference = 1000.0 * (heights[high] - heights[low])
     measured = float(calibration.height_um(above.column_px) - calibration.height_um(below.column_px))
     askew_px = 0.0
-    if math.isfinite(gauge.u_askew_px):
+    if gauge.levelled and math.isfinite(gauge.u_askew_px):
         askew_px = gauge.u_askew_px * (above.middle - below.middle)
     u_treads = abs(1000.0 * calibration.slope_mm_per_px) * math.sqrt(
         below.u_column_px**2 + above.u_column_px**2 + askew_px**2

@@ -8,9 +8,10 @@ scan), and what each one's column is, with an uncertainty from the scatter of bl
 2. A wall is where the medians of the places before and behind differ by more than the noise allows, and by at least
    `LEAST_STEP_PX`. Between walls lie treads; those shorter than `FEWEST_PLACES` are chamfers or dirt.
 3. Beside every wall a guard is left out: there the line is cut in two, and a window of averaged images sees both sides.
-4. A gauge laid askew shows the same slope on every tread. It is estimated from all treads together and, where chance
-   gives such a slope once in a thousand times, taken out; otherwise it would be mistaken for a part of the scale (0.1
-   degrees over 7 mm are 12 um, 1.6 % of the paper's gauge).
+4. A gauge laid askew shows the same slope on every tread, and would be mistaken for a part of the scale (0.1 degrees
+   over 7 mm are 12 um, 1.6 % of the paper's gauge). The slope is estimated from all treads together and taken out,
+   always: to take it out only where it is significant leaves slopes of up to three uncertainties in. Its uncertainty
+   is one of the scale. Who knows that the gauge lies true may say so (``level=False``).
 5. A tread's column is the mean of its pixels without those far off (4 robust standard deviations from the median).
 """
 
@@ -38,18 +39,19 @@ FEWEST_PLACES = 8
 FEWEST_PIXELS = 30
 SURE = 5.5
 """A wall stands out of the noise of the medians by so many standard deviations."""
-GUARD_ROWS = 3
+GUARD_ROWS = 8
+"""On simulated gauges (f/5.6) the next tread draws a row 3 from the wall by 1.3 um, one 8 from it by 0.2 um."""
 DIAGONAL_STEPS = 7
 """Images before and behind the window that space-time analysis reads on the paper's rig."""
 REACH = 6
 """Places looked at on either side of a possible wall."""
 FAR_OFF = 4.0
 ASKEW = 0.001
-"""A common slope is taken out when chance alone would give it with less than this probability."""
+"""A slope that chance alone gives with less than this probability contradicts that the gauge lies true."""
 FLAT = 0.1
 """Treads may bend by this share of the smallest step between neighbours, beyond what noise explains."""
-NOISE_OF_THIRDS = 8.0
-"""How far noise moves the medians of the thirds of a tread apart: in noise of a place over root of the places, with
+NOISE_OF_PARTS = 9.0
+"""How far noise moves the medians of the sixths of a tread apart: in noise of a place over root of the places, with
 room for grains of speckle that span four places."""
 BLOCK = 10
 """Side of the blocks whose scatter gives uncertainties, pixels: larger than speckle and than an SCI window."""
@@ -92,6 +94,12 @@ class Gauge:
     askew_px: float
     u_askew_px: float
     levelled: bool
+    chance_askew: float = 1.0
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the treads slope although the gauge was said to lie true."""
+        return not self.levelled and self.chance_askew < ASKEW
 
     @property
     def askew_um_per_mm(self) -> float:
@@ -111,7 +119,7 @@ class Gauge:
         """What the slope's uncertainty allows the whole scale to be wrong by, as a share."""
         columns = [t.column_px for t in self.treads]
         u = self.u_from_askew_px / (max(columns) - min(columns))
-        return u if math.isfinite(u) else 0.0
+        return u if self.levelled and math.isfinite(u) else 0.0
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -127,7 +135,7 @@ class Gauge:
         }  # fmt: skip
 
 
-def find_gauge(image: RangeImage, um_per_px: float | None = None) -> Gauge:
+def find_gauge(image: RangeImage, um_per_px: float | None = None, *, level: bool = True) -> Gauge:
     """Find the treads of the step gauge in a range image.
 
     ``um_per_px`` (default: the stack header's) only turns the common slope into um per mm. Both directions are tried;
@@ -146,7 +154,7 @@ def find_gauge(image: RangeImage, um_per_px: float | None = None) -> Gauge:
         most = max(most, len(spans))
         if len(spans) < 2:
             continue
-        gauge = _measured(values, spans, direction, pitches[direction], scale)
+        gauge = _measured(values, spans, direction, pitches[direction], scale, level)
         if len(gauge.treads) < 2:
             continue
         bend = max(bend, _bend(values, gauge))
@@ -173,16 +181,15 @@ def find_gauge(image: RangeImage, um_per_px: float | None = None) -> Gauge:
 
 
 def _bend(values: Float64, gauge: Gauge) -> float:
-    """How far the thirds of a tread are apart at worst, beyond their noise, as a share of the smallest step."""
+    """How far the sixths of a tread are apart at worst, beyond their noise, as a share of the smallest step."""
     step = min(abs(a.column_px - b.column_px) for a, b in pairwise(gauge.treads))
     worst = 0.0
     for tread in gauge.treads:
         rows = np.arange(tread.first, tread.last)
         level = values[rows] - (gauge.askew_px * (rows - tread.middle))[:, None]
-        parts = [part[np.isfinite(part)] for part in np.array_split(level, 3)]
-        medians = [float(np.median(part)) for part in parts if part.size]
         places = np.array([float(np.median(one[np.isfinite(one)])) for one in level if np.isfinite(one).any()])
-        noise = NOISE_OF_THIRDS * _noise(places) / math.sqrt(rows.size / 3.0)
+        medians = [float(np.median(part)) for part in np.array_split(places, 6) if part.size]
+        noise = NOISE_OF_PARTS * _noise(places) / math.sqrt(max(1.0, places.size / 6.0))
         worst = max(worst, max(medians) - min(medians) - noise)
     return worst / step if step > 0 else math.inf
 
@@ -259,8 +266,9 @@ def _spans(values: Float64, guard: int) -> list[tuple[int, int]]:
     walls = _walls(level)
     spans = []
     for first, last in zip([0, *walls], [*walls, places.size], strict=True):
-        low = int(places[first]) + (guard if first > 0 else 1)
-        high = int(places[last - 1]) + 1 - (guard if last < places.size else 1)
+        near = min(guard, max(3, (last - first) // 4))
+        low = int(places[first]) + (near if first > 0 else 1)
+        high = int(places[last - 1]) + 1 - (near if last < places.size else 1)
         if high - low >= FEWEST_PLACES:
             spans.append((low, high))
     return _joined(spans, level, places)
@@ -312,11 +320,11 @@ def _joined(spans: list[tuple[int, int]], level: Float64, places: NDArray[np.int
 
 
 def _measured(
-    values: Float64, spans: list[tuple[int, int]], direction: Direction, pitch_um: float, um_per_px: float
+    values: Float64, spans: list[tuple[int, int]], direction: Direction, pitch_um: float, um_per_px: float, level: bool
 ) -> Gauge:
     slopes = [_slope(values[low:high]) for low, high in spans]
     askew, u_askew, chance = _common(slopes)
-    levelled = chance < ASKEW
+    levelled = level and math.isfinite(u_askew)
     places = np.arange(values.shape[0], dtype=np.float64)
     middle = (spans[0][0] + spans[-1][1] - 1) / 2.0
     flat = values - (askew * (places - middle))[:, None] if levelled else values
@@ -325,24 +333,25 @@ def _measured(
         mean, u, pixels = _mean(flat[low:high])
         if pixels >= FEWEST_PIXELS:
             treads.append(Tread(low, high, mean, u, pixels, slope.value, slope.u))
-    return Gauge(tuple(treads), direction, pitch_um, um_per_px, askew, u_askew, levelled)
+    return Gauge(tuple(treads), direction, pitch_um, um_per_px, askew, u_askew, levelled, chance)
 
 
 def _common(slopes: Sequence[_Slope]) -> tuple[float, float, float]:
     """The slope of all treads together, its standard uncertainty, and the probability that chance gave it."""
-    known = [one for one in slopes if one.u > 0 and one.freedom > 0]
+    known = [one for one in slopes if one.freedom > 0]
     if not known:
         return 0.0, math.nan, 1.0
-    weights = np.array([1.0 / one.u**2 for one in known])
+    weights = np.array([one.weight for one in known])
     values = np.array([one.value for one in known])
     slope = float(weights @ values / weights.sum())
-    u = 1.0 / math.sqrt(float(weights.sum()))
     freedom = sum(one.freedom for one in known)
+    variance = sum(one.squares for one in known) / freedom
     if len(known) > 1:
         # Treads of feeler gauges are not parallel to each other; their disagreement counts when it is larger.
-        scatter = float(weights @ (values - slope) ** 2) / (len(known) - 1)
-        if scatter > 1.0:
-            u, freedom = u * math.sqrt(scatter), len(known) - 1
+        between = float(weights @ (values - slope) ** 2) / (len(known) - 1)
+        if between > variance:
+            variance, freedom = between, len(known) - 1
+    u = max(math.sqrt(variance / float(weights.sum())), 1e-12)
     return slope, u, 2.0 * float(student.sf(abs(slope) / u, freedom))
 
 
@@ -383,11 +392,18 @@ def _blocks(values: Float64) -> Float64:
 
 @dataclass(frozen=True)
 class _Slope:
-    """px per place, standard uncertainty, degrees of freedom; NaN, NaN, 0 where too little was measured."""
+    """px per place; the sum of squares of the places, that of the residuals, and their degrees of freedom."""
 
     value: float
-    u: float
+    weight: float
+    squares: float
     freedom: int
+
+    @property
+    def u(self) -> float:
+        if self.freedom < 1:
+            return math.nan
+        return math.sqrt(self.squares / self.freedom / self.weight)
 
 
 def _slope(values: Float64) -> _Slope:
@@ -402,10 +418,10 @@ def _slope(values: Float64) -> _Slope:
                 middles.append(float(places[np.nonzero(finite)[0]].mean()))
                 means.append(float(block[finite].mean()))
     if len(means) < 3 or np.ptp(middles) == 0:
-        return _Slope(math.nan, math.nan, 0)
-    with np.errstate(all="ignore"):
-        fit = fit_line(middles, means)
-    return _Slope(fit.slope, max(fit.u_slope, 1e-12), len(means) - 2)
+        return _Slope(math.nan, math.nan, math.nan, 0)
+    fit = fit_line(middles, means)
+    x = np.array(middles) - np.mean(middles)
+    return _Slope(fit.slope, float(x @ x), float(fit.residuals @ fit.residuals), len(means) - 2)
 
 
 def _line_through(values: Float64) -> Float64:

@@ -29,6 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--recipe", default=GAUGE_RECIPE, help="recipe for the gauge's scan (default: fused, unaveraged)"
     )
+    parser.add_argument("--lies-true", action="store_true", help="the gauge is not tilted: do not take its slope out")
     parser.add_argument("--gauge-name", default="", help="gauge and certificate, kept with the calibration")
     parser.add_argument("--measured-on", metavar="DATE", help="day of the measurement, as 2026-11-24")
     parser.add_argument("--expires-on", metavar="DATE", help="last day of validity")
@@ -59,7 +60,7 @@ def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
         if arguments.heights is None:
             raise BadInput("--gauge needs --heights, the certified height of every tread in mm, in order")
         image = range_image_of(arguments.gauge, arguments.recipe)
-        gauge = find_gauge(image)
+        gauge = find_gauge(image, level=not arguments.lies_true)
         if axis is None:
             axis = (image.provenance["header"]["columns"] - 1) / 2.0
         heights = match_heights(gauge, heights_mm(arguments.heights))
@@ -117,10 +118,12 @@ def _lines(line: Calibration, gauge: Gauge | None, comparison: Comparison | None
         f"standing       {line.standing(dt.date.today())[1]}",  # noqa: DTZ011
     ]
     if gauge is not None:
-        taken = "taken out" if gauge.levelled else "not taken out: chance may give as much"
+        taken = "taken out" if gauge.levelled else "left in, as it was said to lie true"
         lines.append(f"gauge          {len(gauge.treads)} treads found along the {gauge.direction}")
         askew = f"{gauge.askew_um_per_mm:.2f} +- {gauge.u_askew_um_per_mm:.2f} um per mm"
         lines.append(f"laid askew     {askew} ({taken})")
+        if gauge.contradicts:
+            lines.append("note           the treads slope more than chance allows; leave --lies-true out")
         lines.append(f"scale          known to {100 * line.u_slope_relative:.2f} %, what the tilt leaves open included")
     lines += ["", "  height mm   column px" + ("  u(column) px" if gauge else "") + "   residual um   left out um"]
     both = "   eq. (1): residual, left out um" if comparison is not None else ""

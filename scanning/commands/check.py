@@ -23,6 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     step.add_argument("--step", metavar="MM", type=float, help="height of the one step in the image")
     step.add_argument("--heights", metavar="MM,MM,...", help="heights of all treads, when there are more than two")
     parser.add_argument("--u-step-um", type=float, default=0.0, help="standard uncertainty of the step's own height")
+    parser.add_argument("--lies-true", action="store_true", help="the standard is not tilted: its slope is left in")
     parser.add_argument("--recipe", default=GAUGE_RECIPE, help="recipe for the scan (default: fused, unaveraged)")
     parser.add_argument("--taken-on", metavar="DATE", help="day of the check (default: today)")
     parser.add_argument("--history", metavar="FILE.csv", type=Path, help="earlier checks; this one is added")
@@ -39,7 +40,8 @@ def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     heights = [0.0, arguments.step] if arguments.heights is None else heights_mm(arguments.heights)
     if arguments.step is not None and not 0 < abs(arguments.step) < 1e3:
         raise BadInput(f"--step {arguments.step} is not a height in mm; write for example 0.36")
-    gauge = find_gauge(range_image_of(arguments.stack, arguments.recipe), 1000.0 * calibration.slope_mm_per_px)
+    image = range_image_of(arguments.stack, arguments.recipe)
+    gauge = find_gauge(image, 1000.0 * calibration.slope_mm_per_px, level=not arguments.lies_true)
     check = measure_step(
         gauge,
         heights,
