@@ -37,6 +37,8 @@ Direction = Literal["rows", "profiles"]
 LEAST_STEP_PX = 1.0
 FEWEST_PLACES = 8
 FEWEST_PIXELS = 30
+CHAMFER = 8
+"""Places of rounded edges, dirt and short pieces that may lie between two treads, beside the guards."""
 SURE = 5.5
 """A wall stands out of the noise of the medians by so many standard deviations."""
 GUARD_ROWS = 8
@@ -147,7 +149,7 @@ def find_gauge(image: RangeImage, um_per_px: float | None = None, *, level: bool
     guards: dict[Direction, int] = {"rows": GUARD_ROWS, "profiles": _smeared(image) + 1}
     pitches: dict[Direction, float] = {"rows": image.row_pitch_um, "profiles": image.profile_pitch_um}
     best: tuple[float, Gauge] | None = None
-    most, bend = 0, 0.0
+    most, bend, ramp = 0, 0.0, 0
     for direction in ("rows", "profiles"):
         values = column if direction == "rows" else column.T
         spans = _spans(values, guards[direction])
@@ -158,13 +160,19 @@ def find_gauge(image: RangeImage, um_per_px: float | None = None, *, level: bool
         if len(gauge.treads) < 2:
             continue
         bend = max(bend, _bend(values, gauge))
-        if bend > FLAT:
+        ramp = max(ramp, _ramp(values, gauge, guards[direction]))
+        if bend > FLAT or ramp > 0:
             continue
         columns = np.array([t.column_px for t in gauge.treads])
         weight = np.array([t.pixels for t in gauge.treads], dtype=np.float64)
         explained = float(weight @ (columns - weight @ columns / weight.sum()) ** 2)
         if best is None or explained > best[0]:
             best = explained, gauge
+    if best is None and ramp > 0:
+        raise BadInput(
+            f"between two level parts the surface rises over {ramp} places instead of in a wall, so this is no step "
+            "gauge; scan the gauge, or a cleaner part of it"
+        )
     if best is None and bend > FLAT:
         raise BadInput(
             f"what lies between the walls is not flat (it bends by {100 * bend:.0f} % of a step), so these are no "
@@ -192,6 +200,13 @@ def _bend(values: Float64, gauge: Gauge) -> float:
         noise = NOISE_OF_PARTS * _noise(places) / math.sqrt(max(1.0, places.size / 6.0))
         worst = max(worst, max(medians) - min(medians) - noise)
     return worst / step if step > 0 else math.inf
+
+
+def _ramp(values: Float64, gauge: Gauge, guard: int) -> int:
+    """The most measured places between two treads, when they are more than guards and a chamfer explain; else 0."""
+    measured = np.asarray(np.isfinite(values).any(axis=1))
+    between = [int(measured[a.last : b.first].sum()) for a, b in pairwise(gauge.treads)]
+    return max((n for n in between if n > 2 * guard + max(CHAMFER, guard)), default=0)
 
 
 def match_heights(gauge: Gauge, heights_mm: Sequence[float]) -> list[float]:

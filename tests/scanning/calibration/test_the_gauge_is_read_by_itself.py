@@ -160,10 +160,17 @@ def test_a_dark_scan_is_no_gauge() -> None:
 
 
 def test_bent_parts_between_walls_are_no_treads() -> None:
-    column = stairs((0.0, 0.5, 1.0), tread=80)
-    bent = column + 15.0 * np.sin(np.arange(240) / 80 * 2 * np.pi)[:, None]
+    column = stairs((0.0, 0.1, 0.2), tread=80)
+    bow = 2.5 * np.tile(np.linspace(-1, 1, 80) ** 2, 3)
     with pytest.raises(BadInput, match="is not flat"):
-        find_gauge(image_of(bent))
+        find_gauge(image_of(column + bow[:, None]))
+
+
+def test_a_wavy_plate_is_no_gauge() -> None:
+    """Its crests and troughs are level, and something rises in between; but over many rows."""
+    wave = 60.0 * np.sin(np.arange(480) / 480 * 4 * np.pi)[:, None]
+    with pytest.raises(BadInput, match="instead of in a wall"):
+        find_gauge(image_of(stairs((0.3,), tread=480) + wave))
 
 
 def test_averaged_images_blur_walls_along_the_scan_and_are_kept_away_from() -> None:
