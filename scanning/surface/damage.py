@@ -34,6 +34,7 @@ from scanning.surface.filters import (
 from scanning.surface.noise import Noise, robust_sigma
 from scanning.surface.settings import InspectionSettings
 from scanning.surface.uncertainty import Budget
+from scanning.surface.uneven import by_light, by_place
 
 Labels = NDArray[np.int32]
 
@@ -136,31 +137,6 @@ class Detection:
     sigma_wide_um: float
 
 
-def uneven_noise(residual_um: Float32, smoothed_um: Float32, sound: Mask) -> Float32:
-    """Noise of each neighbourhood over the noise of the whole image, between 1 and 3.
-
-    Dark or oxidised stretches return a noisier line; one threshold for all would call them damaged. What is left after
-    smoothing is used, so a pit does not count as noise, and never less than 1: a quiet corner earns no extra alarms.
-    """
-    rough = np.where(sound, residual_um - smoothed_um, np.float32(np.nan))
-    overall = robust_sigma(rough[sound])
-    shape = residual_um.shape
-    size = tuple(max(8, min(32, length // 4)) for length in shape)
-    count = tuple(max(1, length // step) for length, step in zip(shape, size, strict=True))
-    if not overall > 0 or count[0] * count[1] < 9:
-        return np.ones(shape, dtype=np.float32)
-    inner = rough[: count[0] * size[0], : count[1] * size[1]]
-    blocks = np.abs(inner.reshape(count[0], size[0], count[1], size[1]).transpose(0, 2, 1, 3))
-    blocks = np.sort(blocks.reshape(count[0] * count[1], -1), axis=1)
-    measured = np.count_nonzero(np.isfinite(blocks), axis=1)
-    median = np.take_along_axis(blocks, np.maximum(measured - 1, 0)[:, None] // 2, axis=1)[:, 0]
-    ratio = np.where(measured >= 30, 1.4826 * median / overall, 1.0).reshape(count)
-    ratio = np.clip(ndimage.median_filter(ratio, size=3, mode="nearest"), 1.0, 3.0).astype(np.float32)
-    # A fifth above average is what 1000 correlated pixels scatter by chance.
-    ratio[ratio < 1.2] = 1.0
-    return np.asarray(cv2.resize(ratio, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR), dtype=np.float32)
-
-
 def detect(
     residual_um: Float32,
     valid: Mask,
@@ -168,11 +144,13 @@ def detect(
     profile_pitch_um: float,
     settings: InspectionSettings,
     *,
+    intensity: Float32 | None = None,
     sign: int = -1,
 ) -> Detection:
     """Find connected areas of missing (sign -1) or raised (sign +1) material in a residual image (rows, profiles).
 
-    ``valid`` marks the pixels that may be judged. Threshold: seed_k sigma_g to start, grow_k sigma_g to spread, with
+    ``valid`` marks the pixels that may be judged, ``intensity`` is the line's where it is
+    known. Threshold: seed_k sigma_g to start, grow_k sigma_g to spread, with
     sigma_g the robust standard deviation of the smoothed image itself, so correlated noise and leftover form raise it.
     """
     lost = (sign * residual_um).astype(np.float32)
@@ -192,7 +170,9 @@ def detect(
     sigmas = [0.0, 0.0, 0.0]
     found = np.zeros_like(valid)
     scales = (light, small, wide)
-    uneven = uneven_noise(lost, small.value, valid)
+    uneven = by_place(lost, small.value, valid)
+    if intensity is not None:
+        uneven = np.maximum(uneven, by_light(small.value, intensity, valid, row_pitch_um, profile_pitch_um))
     # The second pass measures the noise again without what the first pass found.
     for _ in range(2):
         field = [sound & (image.density > 0.6) for image in scales]
