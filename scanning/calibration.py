@@ -12,6 +12,7 @@ Source: Amir and Thornberg 2017, section 4.5 and Table 2; ordinary least squares
 from __future__ import annotations
 
 import csv
+import datetime as dt
 import hashlib
 import io
 import json
@@ -19,7 +20,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,6 +31,9 @@ FORMAT = "edgewatch-calibration/1"
 FEWEST_PAIRS = 3
 STEEPEST_MM_PER_PX = 10.0
 """As for a stack's mm_per_pixel: heights written in um give 14 on IS1 and would pass for a good line."""
+DUE_DAYS = 30
+"""A calibration that expires within so many days is due."""
+State = Literal["valid", "due", "expired", "without expiry"]
 HEIGHT = "height_mm"
 COLUMN = "column_px"
 
@@ -51,6 +55,12 @@ class LineFit:
     r_squared: float
     residuals: NDArray[np.float64]
     leverage: NDArray[np.float64]
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """Covariance of (intercept, slope), (2, 2), in the units of y, and y per x."""
+        mixed = self.correlation * self.u_intercept * self.u_slope
+        return np.array([[self.u_intercept**2, mixed], [mixed, self.u_slope**2]])
 
     @property
     def leave_one_out(self) -> NDArray[np.float64]:
@@ -92,7 +102,8 @@ class Calibration:
     ``heights_mm`` and ``columns_px`` are the gauge pairs in the order given; ``residuals_um`` and
     ``leave_one_out_each_um`` belong to them one by one. ``leave_one_out_um`` is the LARGEST absolute leave-one-out
     error (14.0 um for the paper's IS1, 28.4 um for IS2), as ``max_residual_um`` is the largest absolute residual.
-    ``measured_on`` and ``expires_on`` are ISO dates or None.
+    ``measured_on`` and ``expires_on`` are ISO dates or None. ``u_scale_relative`` is what stretches all heights alike
+    and so leaves no residual: how sure the gauge's tilt is known, its certificate.
     """
 
     heights_mm: tuple[float, ...]
@@ -111,6 +122,7 @@ class Calibration:
     gauge: str = ""
     measured_on: str | None = None
     expires_on: str | None = None
+    u_scale_relative: float = 0.0
 
     @property
     def pairs(self) -> int:
@@ -126,9 +138,26 @@ class Calibration:
         return min(self.heights_mm), max(self.heights_mm)
 
     @property
+    def covariance(self) -> NDArray[np.float64]:
+        """Covariance of (intercept, slope), (2, 2): mm2, mm2 per px, mm2 per px2."""
+        mixed = self.correlation * self.u_intercept_mm * self.u_slope_mm_per_px
+        return np.array([[self.u_intercept_mm**2, mixed], [mixed, self.u_slope_mm_per_px**2]])
+
+    def standing(self, on: dt.date) -> tuple[State, str]:
+        """Whether the calibration holds on a day, and the sentence that says so. The last day still counts."""
+        if self.expires_on is None:
+            return "without expiry", "The calibration has no expiry date; calibrate with one."
+        left = (dt.date.fromisoformat(self.expires_on) - on).days
+        if left < 0:
+            return "expired", f"The calibration expired on {self.expires_on}, {-left} days ago; calibrate again."
+        if left <= DUE_DAYS:
+            return "due", f"The calibration expires on {self.expires_on}, in {left} days."
+        return "valid", f"The calibration is valid until {self.expires_on}."
+
+    @property
     def u_slope_relative(self) -> float:
-        """u(slope) / |slope|, without unit."""
-        return self.u_slope_mm_per_px / abs(self.slope_mm_per_px)
+        """u(slope) / |slope|, without unit: of the line, and of the gauge's scale as a whole."""
+        return math.hypot(self.u_slope_mm_per_px / abs(self.slope_mm_per_px), self.u_scale_relative)
 
     def height_um(self, column_px: ArrayLike) -> NDArray[np.float64]:
         """Height in um of a line seen at ``column_px`` (0-based columns, any shape). NaN stays NaN."""
@@ -165,6 +194,7 @@ class Calibration:
             "model": "straight line, height on pixel",
             "pairs": self.pairs,
             **{name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()},
+            "covariance": self.covariance.tolist(),
             "u_slope_percent": 100.0 * self.u_slope_relative,
             "calibrated_range_px": list(self.range_px),
             "calibrated_range_mm": list(self.range_mm),
@@ -180,14 +210,16 @@ class Calibration:
             heights = [float(value) for value in stored["heights_mm"]]
             columns = [float(value) for value in stored["columns_px"]]
             slope = float(stored["slope_mm_per_px"])
+            u_scale = float(stored.get("u_scale_relative", 0.0))
         except (KeyError, TypeError, ValueError) as error:
             raise BadInput(f"{where} lacks or garbles {error}; write it again with calibrate") from error
         calibration = calibrate(
             heights,
             columns,
             gauge=str(stored.get("gauge") or ""),
-            measured_on=stored.get("measured_on"),
-            expires_on=stored.get("expires_on"),
+            measured_on=_text_or_none(stored.get("measured_on")),
+            expires_on=_text_or_none(stored.get("expires_on")),
+            u_scale_relative=u_scale,
             where=where,
         )
         if not math.isclose(calibration.slope_mm_per_px, slope, rel_tol=1e-9):
@@ -199,7 +231,8 @@ class Calibration:
 
     def sha256(self) -> str:
         """Identity of the calibration: the hash of what it was made from, not of figures that a CPU may round."""
-        origin = [FORMAT, self.heights_mm, self.columns_px, self.gauge, self.measured_on, self.expires_on]
+        origin: list[Any] = [FORMAT, self.heights_mm, self.columns_px, self.gauge, self.measured_on, self.expires_on]
+        origin += [self.u_scale_relative] if self.u_scale_relative else []
         told = json.dumps(origin, separators=(",", ":"), allow_nan=False)
         return hashlib.sha256(told.encode()).hexdigest()
 
@@ -211,12 +244,21 @@ def calibrate(
     gauge: str = "",
     measured_on: str | None = None,
     expires_on: str | None = None,
+    u_scale_relative: float = 0.0,
     where: str = "the gauge pairs",
 ) -> Calibration:
     """Fit height on pixel through gauge pairs. ``where`` names their origin in the sentence of a `BadInput`.
 
-    Refused: fewer than three pairs, values that are not finite, fewer than three different columns or heights.
+    Refused: fewer than three pairs, values that are not finite, fewer than three different columns or heights, dates
+    that are no ISO dates (2026-11-24) or an expiry before the measurement.
     """
+    if not (math.isfinite(u_scale_relative) and u_scale_relative >= 0.0):
+        raise BadInput(f"{where}: u_scale_relative is {u_scale_relative}, not a number from 0 upwards; calibrate again")
+    measured, expires = _day(measured_on, "measured_on", where), _day(expires_on, "expires_on", where)
+    if measured is not None and expires is not None and expires < measured:
+        raise BadInput(
+            f"{where}: it would expire on {expires}, before it was measured on {measured}; correct the dates"
+        )
     if len(heights_mm) != len(columns_px):
         raise BadInput(f"{where}: {len(heights_mm)} heights but {len(columns_px)} columns; give one column per height")
     if len(heights_mm) < FEWEST_PAIRS:
@@ -262,7 +304,21 @@ def calibrate(
         gauge=gauge,
         measured_on=measured_on,
         expires_on=expires_on,
+        u_scale_relative=u_scale_relative,
     )
+
+
+def _text_or_none(stored: object) -> str | None:
+    return None if stored is None else str(stored)
+
+
+def _day(written: str | None, what: str, where: str) -> dt.date | None:
+    if written is None:
+        return None
+    try:
+        return dt.date.fromisoformat(written)
+    except ValueError:
+        raise BadInput(f'{where}: {what} is "{written}", not a date; write it as 2026-11-24') from None
 
 
 def read_pairs(text: str, where: str = "the gauge pairs") -> tuple[list[float], list[float]]:

@@ -54,7 +54,8 @@ class PrecisionReport:
     ``sigma_robust_um``: 1.4826 x the median absolute deviation there, which wild pixels do not move; ``wild``: pixels
     there more than 6 robust sigmas off the plane. ``lateral_cell_um``: [along the scan, along the rows], what one value
     is averaged over. ``correlation_scan``, ``correlation_rows``: of the errors at lags 1, 2, 3.
-    ``ns_per_range_pixel``: wall time; ``cpu_ns_per_range_pixel``: processor time.
+    ``ns_per_range_pixel``: wall time; ``cpu_ns_per_range_pixel``: processor time. ``outside_calibrated``: heights
+    beyond the gauge's range; None when they do not come from a gauge.
     """
 
     undefined: int
@@ -70,12 +71,14 @@ class PrecisionReport:
     correlation_rows: tuple[float | None, ...]
     ns_per_range_pixel: float | None
     cpu_ns_per_range_pixel: float | None
+    outside_calibrated: int | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Plain JSON values with the keys of contract 3."""
         return {
             "undefined": {"count": self.undefined, "share": self.undefined_share},
             "saturated": {"count": self.saturated, "share": self.saturated_share},
+            "outside_calibrated": None if self.outside_calibrated is None else {"count": self.outside_calibrated},
             "sigma_um": self.sigma_um,
             "sigma_robust_um": self.sigma_robust_um,
             "wild_pixels_in_flat_region": self.wild,
@@ -115,6 +118,7 @@ def precision_of(image: RangeImage, flat: FlatRegion | None = None) -> Precision
             scan = tuple(_correlation(tame[:, :-lag], tame[:, lag:]) for lag in (1, 2, 3))
             rows = tuple(_correlation(tame[:-lag], tame[lag:]) for lag in (1, 2, 3))
     size = image.height_um.size
+    outside = image.outside_calibrated
     return PrecisionReport(
         undefined=image.undefined,
         undefined_share=image.undefined_share,
@@ -129,6 +133,7 @@ def precision_of(image: RangeImage, flat: FlatRegion | None = None) -> Precision
         correlation_rows=rows,
         ns_per_range_pixel=1e9 * image.wall_s / size if size and image.wall_s > 0 else None,
         cpu_ns_per_range_pixel=1e9 * image.cpu_s / size if size and image.cpu_s > 0 else None,
+        outside_calibrated=None if outside is None else int(np.count_nonzero(outside)),
     )
 
 

@@ -28,8 +28,8 @@ class RangeImage:
 
     Arrays are (rows, profiles): rows along the laser line, profiles along the scan. NaN means not measured.
     ``height_um`` is positive out of the material. ``intensity`` is the grey value of the line's peak as the centroid
-    saw it, ``width_px`` its full width at half maximum. ``confidence``, 0 to 1, says how sure it is that a point is on the
-    laser line and not on a reflection (above 0.9 fewer than 1 in 1000 are not); None where nothing said so.
+    saw it, ``width_px`` its full width at half maximum. ``confidence``, 0 to 1, says how sure it is that a point is on
+    the laser line and not on a reflection (above 0.9 fewer than 1 in 1000 are not); None where nothing said so.
     ``row_pitch_um`` lies along the rows, ``profile_pitch_um`` along the scan (41.65 for block SCI, 8.33 sliding).
     ``saturated`` counts saturated pixels in the frames used, ``frame_pixels`` all pixels looked at.
     ``provenance`` is JSON-serialisable: recipe in full, header, calibration, software versions, estimated values.
@@ -58,15 +58,35 @@ class RangeImage:
         return self.undefined / self.height_um.size if self.height_um.size else 1.0
 
     @property
+    def outside_calibrated(self) -> NDArray[np.bool_] | None:
+        """(rows, profiles) True where a height is extrapolated: its column lies beyond the gauge's.
+
+        None when the heights are not from a gauge (the stack header's mm per pixel), or its range is not told.
+        """
+        calibration = self.provenance.get("calibration")
+        span = calibration.get("calibrated_range_px") if isinstance(calibration, dict) else None
+        if not isinstance(span, (list, tuple)) or len(span) != 2:
+            return None
+        # float32, as columns are kept: a tread's own column must not fall outside by its rounding.
+        low, high = np.float32(span[0]), np.float32(span[1])
+        finite = np.isfinite(self.height_um)
+        return np.asarray(finite & ~((self.column_px >= low) & (self.column_px <= high)), dtype=np.bool_)
+
+    @property
     def saturated_share(self) -> float:
         return self.saturated / self.frame_pixels if self.frame_pixels else 0.0
 
     def save(self, path: Path | str) -> None:
         """Write ``range.npz`` (contract 3): the arrays as float32, both pitches, counts, and provenance as JSON text.
 
+        With a calibration also ``outside_calibrated`` (bool), for those who read the file with other software.
+
         The file appears whole or not at all.
         """
-        told = {} if self.confidence is None else {"confidence": self.confidence.astype(np.float32, copy=False)}
+        outside = self.outside_calibrated
+        told: dict[str, Any] = {} if outside is None else {"outside_calibrated": outside}
+        if self.confidence is not None:
+            told["confidence"] = self.confidence.astype(np.float32, copy=False)
         with whole_file(path) as part, part.open("wb") as file:
             np.savez(
                 file,
@@ -88,7 +108,8 @@ class RangeImage:
     def load(path: Path | str) -> RangeImage:
         """Read what `save` wrote, or a foreign .npz with ``height_um``, ``row_pitch_um`` and ``profile_pitch_um``.
 
-        Channels that are not there become NaN, a confidence that is not there None; infinite heights become NaN. Raises `BadInput` naming file and fault.
+        Channels that are not there become NaN, a confidence that is not there None; infinite heights become NaN.
+        Raises `BadInput` naming file and fault.
         """
         place = Path(path)
         try:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 from typing import Any, Protocol
 
-from scanning.commands import calibrate, inspect, process, simulate
+from scanning.commands import calibrate, check, inspect, noise, process, simulate
 
 
 class Command(Protocol):
@@ -20,4 +20,4 @@ class Command(Protocol):
     def run(self, arguments: argparse.Namespace) -> tuple[dict[str, Any], list[str]]: ...
 
 
-COMMANDS: tuple[Command, ...] = (process, calibrate, inspect, simulate)
+COMMANDS: tuple[Command, ...] = (process, calibrate, check, noise, inspect, simulate)

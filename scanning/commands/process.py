@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import datetime as dt
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from scanning.commands.progress import shown
 from scanning.errors import BadInput
 from scanning.recipe import Recipe
+
+if TYPE_CHECKING:
+    from scanning.calibration import Calibration
 
 NAME = "process"
 HELP = "turn a stack of scan images into a range image and a precision report"
@@ -58,8 +62,25 @@ def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
             image, precision_of(image, flat), stack, arguments.stack.resolve().name, partial=stack.partial
         )
     exports = {f"range.{kind}": WRITERS[kind] for kind in arguments.export}
+    report["warnings"] = _warnings(report, calibration)
     write_results(arguments.out, image, report, exports)
     return report, _lines(report, arguments.out)
+
+
+def _warnings(report: dict[str, Any], calibration: Calibration | None) -> list[str]:
+    """What a reader must know before using the heights."""
+    if calibration is None:
+        return []
+    state, sentence = calibration.standing(dt.date.today())  # noqa: DTZ011 - the mill's own calendar day
+    warnings = [sentence] if state in ("expired", "due") else []
+    outside = (report["outside_calibrated"] or {}).get("count", 0)
+    measured = report["rows"] * report["profiles"] - report["undefined"]["count"]
+    if outside:
+        warnings.append(
+            f"{100 * outside / measured:.1f} % of the heights lie outside the calibrated range; there the straight "
+            "line is an extrapolation (outside_calibrated in range.npz flags each)."
+        )
+    return warnings
 
 
 def _settings(given: list[str]) -> dict[str, str]:
@@ -91,6 +112,7 @@ def _lines(report: dict[str, Any], out: Path) -> list[str]:
         f"cost          {report['ns_per_range_pixel'] or 0:.0f} ns per range pixel",
         f"written to    {out}",
     ]
+    lines += [f"warning       {one}" for one in report["warnings"]]
     if report["stack"]["partial"]:
         lines.insert(1, "note          the stack is partial: its recording did not come to its end")
     return lines

@@ -96,6 +96,7 @@ def _turn(image: RangeImage) -> RangeImage:
         height_um=image.height_um.T,
         intensity=image.intensity.T,
         width_px=image.width_px.T,
+        confidence=None if image.confidence is None else image.confidence.T,
         row_pitch_um=image.profile_pitch_um,
         profile_pitch_um=image.row_pitch_um,
     )
