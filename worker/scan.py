@@ -38,7 +38,7 @@ from scanning.rig.protocols import Frame, SensorMode
 from scanning.rig.rig import Rig, open_rig
 from scanning.rig.session import AcquisitionSummary, Order, ScanPlan, acquire
 from scanning.stacks import PART_SUFFIX, StackWriter, open_stack
-from worker.lease import Lease, LeaseLostError
+from worker.lease import Lease, LeaseLostError, drop_connection
 from worker.live import LiveRangeImage
 from worker.stopping import Watch
 
@@ -87,6 +87,7 @@ class Orders:
             self._show(order)
         except DatabaseError as error:
             log.warning("Scan %s goes on without the database: %s", self._lease.scan_id, error)
+            drop_connection()
             return self._last
         self._last = order
         return order
