@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -47,7 +48,7 @@ def test_the_scans_of_a_tool_stay_together(make_tool: Callable[..., Tool], rig: 
     at_once(*(lambda tool=tool: queue.enqueue_inspection(tool=tool, rig=rig, by=olga) for tool in tools))
 
     order = [scan.region.tool.code for scan in Scan.objects.order_by("position", "pk").select_related("region__tool")]
-    changes = sum(one != other for one, other in zip(order, order[1:], strict=False))
+    changes = sum(one != other for one, other in itertools.pairwise(order))
     assert len(order) == 12
     assert changes == 3, order
     assert len(set(Scan.objects.values_list("position", flat=True))) == 12
