@@ -112,6 +112,9 @@ DATA_UPLOAD_MAX_NUMBER_FILES = 5000
 #: A stack arrives as one upload of many files; larger ones are imported from the command line.
 STACK_UPLOAD_MAX_BYTES = envint("STACK_UPLOAD_MAX_MB", 2048) * 2**20
 
+#: Raw frames of finished scans are removed after so many days; 0 keeps them for ever. Results are never removed.
+STACK_KEEP_DAYS = envint("STACK_KEEP_DAYS", 0)
+
 #: Redis or Valkey: a doorbell, never the truth. `manage.py up` starts one on a unix socket and sets this.
 REDIS_URL = os.environ.get("REDIS_URL", f"redis+socket://{HOME / 'run' / 'valkey.sock'}")
 

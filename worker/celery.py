@@ -25,6 +25,7 @@ from inspection.services.ring import COMPUTE_QUEUE, broker_options
 TICK_EVERY_S = 60.0
 #: Dead workers are found this often: with the lease it bounds how long a scan shows "running" though nobody runs it.
 SWEEP_EVERY_S = 10.0
+MAKE_ROOM_EVERY_S = 6 * 3600.0
 
 app = Celery("worker", broker=settings.REDIS_URL)
 app.conf.update(
@@ -49,6 +50,11 @@ app.conf.update(
             "task": "worker.sweep",
             "schedule": SWEEP_EVERY_S,
             "options": {"queue": COMPUTE_QUEUE, "expires": SWEEP_EVERY_S - 1.0},
+        },
+        "make room": {
+            "task": "worker.make_room",
+            "schedule": MAKE_ROOM_EVERY_S,
+            "options": {"queue": COMPUTE_QUEUE, "expires": MAKE_ROOM_EVERY_S},
         },
     },
 )

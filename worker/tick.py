@@ -11,9 +11,11 @@ import logging
 from typing import Any
 
 from celery import signals
+from django.conf import settings
 from django.db.models import Q
 from django.utils import timezone
 
+from inspection.keeping.retention import remove_old_stacks
 from inspection.models import Recomputation, Rig, Scan
 from inspection.services import schedules
 from inspection.services.ring import COMPUTE_QUEUE, ring, ring_measure, ring_recompute
@@ -52,6 +54,15 @@ def sweep() -> None:
     """Find workers that died, between the ticks."""
     for scan_id in lease.sweep():
         log.warning("Scan %s was interrupted: its worker let the lease run out.", scan_id)
+
+
+@app.task(name="worker.make_room", ignore_result=True)
+def make_room() -> None:
+    """Remove the raw frames that the rule lets go; without a rule (STACK_KEEP_DAYS is 0), none."""
+    if settings.STACK_KEEP_DAYS:
+        removed = remove_old_stacks(settings.STACK_KEEP_DAYS)
+        if removed.scans:
+            log.info("Removed the raw frames of %d old scans, %.1f MB.", len(removed.scans), removed.bytes / 1e6)
 
 
 def ring_what_waits(now: dt.datetime) -> None:
