@@ -18,16 +18,20 @@ from django.utils import timezone
 from inspection.keeping.retention import remove_old_stacks
 from inspection.models import Recomputation, Rig, Scan
 from inspection.services import schedules
-from inspection.services.ring import COMPUTE_QUEUE, ring, ring_measure, ring_recompute
+from inspection.services.again import ring_next
+from inspection.services.ring import COMPUTE_QUEUE, ring, ring_measure, ring_recompute, ring_recompute_many
 from inspection.states import QueueState, ScanState
 from worker import lease
 from worker.celery import TICK_EVERY_S, app
-from worker.compute import RECOMPUTATION_LOST
 
 log = logging.getLogger(__name__)
 
 #: A scan may wait this long for its numbers before it is rung for again.
 COMPUTE_PATIENCE = dt.timedelta(seconds=30)
+
+
+#: With a lease that has run out, a recomputation that lost its worker.
+LOST = Q(state=Recomputation.State.RUNNING)
 
 
 @app.task(name="worker.tick", ignore_result=True)
@@ -51,9 +55,14 @@ def tick_at_once(**_: Any) -> None:
 
 @app.task(name="worker.sweep", ignore_result=True)
 def sweep() -> None:
-    """Find workers that died, between the ticks."""
-    for scan_id in lease.sweep():
+    """Find workers that died, between the ticks, and ring for what the dead were computing."""
+    now = timezone.now()
+    for scan_id in lease.sweep(now):
         log.warning("Scan %s was interrupted: its worker let the lease run out.", scan_id)
+    for scan_id in Scan.objects.filter(state=ScanState.PROCESSING, lease_until__lt=now).values_list("pk", flat=True):
+        ring_measure(scan_id)
+    for order_id in Recomputation.objects.filter(LOST, lease_until__lt=now).values_list("pk", flat=True):
+        ring_recompute(order_id)
 
 
 @app.task(name="worker.make_room", ignore_result=True)
@@ -77,8 +86,11 @@ def ring_what_waits(now: dt.datetime) -> None:
     late = Q(progress_at__isnull=True) | Q(progress_at__lt=now - COMPUTE_PATIENCE)
     for scan_id in Scan.objects.filter(free, late, state=ScanState.PROCESSING).values_list("pk", flat=True):
         ring_measure(scan_id)
-    lost = Q(state=Recomputation.State.RUNNING, started_at__lt=now - RECOMPUTATION_LOST)
-    for order_id in Recomputation.objects.filter(lost | Q(state=Recomputation.State.QUEUED)).values_list(
-        "pk", flat=True
-    ):
+    lost = LOST & Q(lease_until__lt=now)
+    waiting = Recomputation.objects.filter(lost | Q(state=Recomputation.State.QUEUED))
+    for order_id in waiting.filter(batch__isnull=True).values_list("pk", flat=True):
         ring_recompute(order_id)
+    for batch_id in waiting.filter(batch__isnull=False).order_by().values_list("batch_id", flat=True).distinct():
+        lost_orders = list(waiting.filter(lost, batch_id=batch_id).values_list("pk", flat=True))
+        ring_recompute_many(lost_orders)
+        ring_next(batch_id)
