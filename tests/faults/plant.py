@@ -117,11 +117,26 @@ class Plant:
         }
 
     def worker(self, queue: str) -> subprocess.Popen[bytes]:
-        name = queue.replace(".", "-")
+        name = queue.split(",")[0].replace(".", "-")
         return self.start(
             name, sys.executable, "-m", "celery", "-A", "worker", "worker", "--pool", "prefork", "--concurrency", "1",
             "--queues", queue, "--hostname", f"{name}@test", "--without-gossip", "--without-mingle",
             "--loglevel", "INFO",
+        )  # fmt: skip
+
+    def compute(self) -> subprocess.Popen[bytes]:
+        return self.worker("compute,again")
+
+    def tick(self) -> subprocess.Popen[bytes]:
+        return self.start(
+            "tick", sys.executable, "-m", "celery", "-A", "worker", "beat", "--schedule", str(self.folder / "beat"),
+            "--pidfile", "", "--loglevel", "INFO",
+        )  # fmt: skip
+
+    def web(self, port: int) -> subprocess.Popen[bytes]:
+        return self.start(
+            "web", sys.executable, "-m", "gunicorn", "inspection.wsgi:application", "--bind", f"127.0.0.1:{port}",
+            "--workers", "1", "--threads", "4", "--no-control-socket",
         )  # fmt: skip
 
     def kill(self, name: str) -> None:
