@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 from django.conf import settings
-from django.utils import timezone
 
 from inspection.models import Inspection, RangeImage, Rig, Scan, Tool, User
 from inspection.services import queue
@@ -156,6 +155,7 @@ class Site:
         if who != "web":
             state = now(scan).state
             tally.states[state] = tally.states.get(state, 0) + 1
+        held = who == "rig worker" and now(scan).state in ON_RIG
         began = time.monotonic()
         self.plant.kill(name)
         if who == "rig worker":
@@ -177,22 +177,12 @@ class Site:
             scan = Scan.objects.latest("pk")
             if scan.inspection.scans.count() != 1 or made > 1:
                 tally.doubled += 1
-        self._follow(who, scan, began, tally)
-
-    def _follow(self, who: str, scan: Scan, began: float, tally: Tally) -> None:
-        def true() -> bool:
-            """No row says that somebody works who does not."""
-            row = now(scan)
-            held = row.state in ON_RIG or (row.state == ScanState.PROCESSING and row.lease_token)
-            return not held or (row.lease_until is not None and row.lease_until > timezone.now())
-
-        if who != "web":
-            while not true() and time.monotonic() - began < STUCK_S:
-                time.sleep(0.05)
-            # Right after the kill a lease may still run: true is what is so once it could have run out.
-            if now(scan).state in ON_RIG and who == "rig worker":
-                wait_until(lambda: now(scan).state not in ON_RIG or _renewed(scan), "a true state", STUCK_S)
+        if held:  # its row says "running" though nobody runs it
+            wait_until(lambda: now(scan).state not in ON_RIG, "a true state", STUCK_S)
             tally.true_after_s.append(time.monotonic() - began)
+        self._follow(scan, began, tally)
+
+    def _follow(self, scan: Scan, began: float, tally: Tally) -> None:
         if not self.ended(scan, STUCK_S):
             tally.stuck += 1
             tally.notes.append(f"scan {scan.pk} is {now(scan).state} {now(scan).phase}")
@@ -227,14 +217,6 @@ class Site:
         except Exception as fault:  # whatever is wrong with it is what is counted
             tally.broken_frames += 1
             tally.notes.append(f"scan {scan.pk}: {fault}")
-
-
-def _renewed(scan: Scan) -> bool:
-    """The scan is on the rig with a lease that a living worker renews."""
-    first = now(scan).lease_until
-    time.sleep(3.5)
-    second = now(scan).lease_until
-    return first is not None and second is not None and second > first
 
 
 def now(scan: Scan) -> Scan:

@@ -60,5 +60,5 @@ def test_a_death_at_any_moment_loses_nothing_and_doubles_nothing(site: kills.Sit
         # The lease, the look for those that ran out, and two slow cores.
         assert max(tally.dark_after_s, default=0.0) < 5.0
         if tally.who == "rig worker":
-            assert max(tally.true_after_s) < 3 * LEASE_S
+            assert max(tally.true_after_s, default=0.0) < LEASE_S + 6.0
     assert not Scan.objects.exclude(state__in=ENDED).exists()
