@@ -33,7 +33,7 @@ class SignInForm(AuthenticationForm):
 
 
 def address_of(request: HttpRequest | None) -> str:
-    """Where a request comes from; behind our own TLS proxy, what that proxy added last. Earlier entries prove nothing."""
+    """Where a request comes from; behind our TLS proxy, what that proxy added last: anybody can write earlier ones."""
     if request is None:
         return ""
     if settings.BEHIND_TLS and (forwarded := request.headers.get("X-Forwarded-For", "")):

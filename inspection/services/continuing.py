@@ -7,9 +7,6 @@ homes again, and every frame is verified before the first new one is taken.
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from django.conf import settings
 from django.db import transaction
 from django.db.models import Min
 from django.utils import timezone
@@ -26,13 +23,12 @@ BROKEN_OFF = (ScanState.INTERRUPTED, ScanState.FAILED)
 
 
 def can_continue(scan: Scan) -> bool:
-    """Whether the scan broke off on a rig with frames to go on from, and nothing was computed from them yet."""
+    """Whether the scan broke off on a rig and nothing was computed from its frames yet.
+
+    It may have died before its first frame, or its frames may be gone: it then starts clean.
+    """
     return (
-        scan.state in BROKEN_OFF
-        and scan.source == Scan.Source.RIG
-        and scan.partial
-        and bool(scan.stack_file)
-        and not scan.range_images.exists()
+        scan.state in BROKEN_OFF and scan.source == Scan.Source.RIG and scan.partial and not scan.range_images.exists()
     )
 
 
@@ -47,12 +43,10 @@ def continue_scan(scan: Scan, by: User | None, *, looked: bool) -> None:
     if not can_continue(scan):
         state = Scan.objects.values_list("state", flat=True).get(pk=scan.pk)
         raise WrongState(
-            f"Scan {scan.pk} is {state} and cannot be continued: only a scan that broke off on a rig, with frames and "
-            f"without a result, can; scan the region again.",
+            f"Scan {scan.pk} is {state} and cannot be continued: only a scan that broke off on a rig and has no "
+            f"result, can; scan the region again.",
             state,
         )
-    if not (Path(settings.STACKS) / scan.stack_file).exists():
-        raise BadInput(f"The frames of scan {scan.pk} are not on the disk any more; scan the region again.")
     with transaction.atomic():
         rig = Rig.objects.select_for_update().get(pk=scan.rig_id)
         first = rig.scans.filter(state=ScanState.QUEUED).aggregate(first=Min("position"))["first"]

@@ -150,6 +150,11 @@ class Site:
                 asking.join()
         else:
             scan = self.order()
+        if who == "compute worker" and tally.moments % 2:  # every other moment while it computes, however short that is
+            deadline = time.monotonic() + STUCK_S
+            while now(scan).state not in (ScanState.PROCESSING, *ENDED) and time.monotonic() < deadline:
+                time.sleep(0.01)
+            at_s /= 10
         time.sleep(at_s)
         name, start = self.start[who]
         if who != "web":
@@ -189,11 +194,7 @@ class Site:
             queue.cancel_scan(scan, None)
             return
         if now(scan).state == ScanState.INTERRUPTED:
-            if now(scan).stack_file:
-                continue_scan(now(scan), self.by, looked=True)
-            else:
-                scan = queue.scan_again(now(scan), self.by)
-                queue.resume_queue(Rig.objects.get(), self.by)
+            continue_scan(now(scan), self.by, looked=True)
             if not self.ended(scan, STUCK_S):
                 tally.stuck += 1
                 tally.notes.append(f"continued scan {scan.pk} is {now(scan).state}")

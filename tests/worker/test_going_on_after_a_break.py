@@ -141,6 +141,18 @@ def test_frames_that_cannot_be_read_at_all_start_the_scan_clean(order: Callable[
     assert now(broken).stack_sha256 == now(whole).stack_sha256
 
 
+def test_a_scan_killed_before_its_first_frame_starts_clean(order: Callable[[], Scan], olga: User) -> None:
+    """The row names a part that was never made."""
+    whole, broken = order(), order()
+    run(FakeRig())
+    killed(broken, at=1)
+    assert not file_of(broken).exists()
+    continue_scan(now(broken), olga, looked=True)
+
+    assert run(FakeRig()) == ScanState.PROCESSING
+    assert now(broken).stack_sha256 == now(whole).stack_sha256
+
+
 def test_it_can_break_off_and_go_on_more_than_once(order: Callable[[], Scan], olga: User) -> None:
     whole, broken = order(), order()
     run(FakeRig())
