@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import sys
 
-from benchmarks import damage, precision
+from benchmarks import coverage, damage, precision
 
-QUESTIONS = {"precision": precision.main, "damage": damage.main}
+QUESTIONS = {"precision": precision.main, "damage": damage.main, "coverage": coverage.main}
 
 
 def main() -> int:
