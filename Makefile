@@ -4,12 +4,14 @@ VENV := .venv
 PY := $(VENV)/bin/python
 PORT ?= 8000
 
-.PHONY: up test lint clean help
+.PHONY: up test test-postgres test-faults lint clean help
 
 help:
 	@echo "make up          set up, start everything, scan the demo knife, stay up until Ctrl-C"
 	@echo "make up ONCE=1   the same, then stop; exit 0 only if R1, R2 and R3 were measured"
 	@echo "make test        install what the tests need and run them all"
+	@echo "make test-postgres  the tests of pages, queue and workers on a scratch PostgreSQL and Redis, where installed"
+	@echo "make test-faults kill -9 of each process at 50 random moments of a scan, and the long fuzz (an hour or more)"
 	@echo "make lint        ruff, mypy, import-linter"
 
 up: $(VENV)/.installed
@@ -17,6 +19,12 @@ up: $(VENV)/.installed
 
 test: $(VENV)/.installed-dev
 	$(PY) -m pytest -n 2 --dist loadfile $(ARGS)
+
+test-postgres: $(VENV)/.installed-dev
+	$(PY) -m tests.postgres tests/inspection tests/worker tests/faults -n 2 --dist loadfile $(ARGS)
+
+test-faults: $(VENV)/.installed-dev
+	TEST_KILLS=50 TEST_FUZZ=10000 $(PY) -m pytest tests/faults -s $(ARGS)
 
 lint: $(VENV)/.installed-dev
 	$(PY) -m ruff check .

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from django.contrib.auth.views import redirect_to_login
-from django.core.exceptions import PermissionDenied
+from django.core.exceptions import BadRequest, PermissionDenied
 from django.http import HttpRequest, HttpResponse, HttpResponseBase
 
 from inspection.models import User
@@ -41,6 +41,29 @@ class ContentSecurityPolicy:
         response.headers.setdefault("Content-Security-Policy", POLICY)
         response.headers.setdefault("Referrer-Policy", "same-origin")
         return response
+
+
+class PlainText:
+    """Refuses text with NUL characters, which no person types and PostgreSQL does not store.
+
+    One place instead of every view: a search field that was forgotten would answer with a fault of the server.
+    """
+
+    def __init__(self, get_response: GetResponse) -> None:
+        self.get_response = get_response
+
+    def __call__(self, request: HttpRequest) -> HttpResponseBase:
+        return self.get_response(request)
+
+    def process_view(
+        self, request: HttpRequest, view: Callable[..., HttpResponseBase], args: Any, kwargs: Any
+    ) -> HttpResponseBase | None:
+        typed = [request.GET, request.POST] if request.method == "POST" else [request.GET]
+        for said in typed:
+            for values in said.lists():
+                if "\0" in values[0] or any("\0" in value for value in values[1] if isinstance(value, str)):
+                    raise BadRequest("The request holds a NUL character, which is no text; type it again.")
+        return None
 
 
 class RoleGate:

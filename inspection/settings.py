@@ -25,6 +25,9 @@ BEHIND_TLS = envbool("BEHIND_TLS", False)
 SECURE_PROXY_SSL_HEADER = ("HTTP_X_FORWARDED_PROTO", "https") if BEHIND_TLS else None
 SESSION_COOKIE_SECURE = CSRF_COOKIE_SECURE = SECURE_SSL_REDIRECT = BEHIND_TLS
 SECURE_HSTS_SECONDS = 3600 if BEHIND_TLS else 0
+SECURE_HSTS_INCLUDE_SUBDOMAINS = BEHIND_TLS
+#: A host inside a mill is never on the browsers' public preload list.
+SILENCED_SYSTEM_CHECKS = ["security.W021"]
 SESSION_COOKIE_AGE = 12 * 3600
 X_FRAME_OPTIONS = "DENY"
 
@@ -51,6 +54,7 @@ MIDDLEWARE = [
     "django.middleware.clickjacking.XFrameOptionsMiddleware",
     "django_htmx.middleware.HtmxMiddleware",
     "inspection.middleware.RoleGate",
+    "inspection.middleware.PlainText",
 ]
 CSRF_FAILURE_VIEW = "inspection.views.errors.forged"
 ROOT_URLCONF = "inspection.urls"
@@ -111,6 +115,9 @@ DATA_UPLOAD_MAX_MEMORY_SIZE = 10 * 2**20
 DATA_UPLOAD_MAX_NUMBER_FILES = 5000
 #: A stack arrives as one upload of many files; larger ones are imported from the command line.
 STACK_UPLOAD_MAX_BYTES = envint("STACK_UPLOAD_MAX_MB", 2048) * 2**20
+
+#: Raw frames of finished scans are removed after so many days; 0 keeps them for ever. Results are never removed.
+STACK_KEEP_DAYS = envint("STACK_KEEP_DAYS", 0)
 
 #: Redis or Valkey: a doorbell, never the truth. `manage.py up` starts one on a unix socket and sets this.
 REDIS_URL = os.environ.get("REDIS_URL", f"redis+socket://{HOME / 'run' / 'valkey.sock'}")

@@ -29,9 +29,10 @@ MOVES: dict[str, frozenset[str]] = {
     ScanState.PAUSED: frozenset({ScanState.RUNNING, ScanState.FAILED, ScanState.CANCELLED, ScanState.INTERRUPTED}),
     ScanState.PROCESSING: frozenset({ScanState.DONE, ScanState.FAILED}),
     ScanState.DONE: frozenset(),
-    ScanState.FAILED: frozenset(),
+    # Back into the queue only by a person who has looked at the rig (`services.continuing`).
+    ScanState.FAILED: frozenset({ScanState.QUEUED}),
     ScanState.CANCELLED: frozenset(),
-    ScanState.INTERRUPTED: frozenset(),
+    ScanState.INTERRUPTED: frozenset({ScanState.QUEUED}),
 }
 
 #: A worker holds the rig.

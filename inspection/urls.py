@@ -7,6 +7,7 @@ from django.urls import URLPattern, URLResolver, include, path
 from inspection.api import api
 from inspection.health import health
 from inspection.views import (
+    again,
     calibrations,
     imports,
     overview,
@@ -42,6 +43,7 @@ scan_urls = [
     path("<int:pk>/resume/", scans.scan_resume, name="scan-resume"),
     path("<int:pk>/finish/", scans.scan_finish, name="scan-finish"),
     path("<int:pk>/again/", scans.scan_again, name="scan-again"),
+    path("<int:pk>/continue/", scans.scan_continue, name="scan-continue"),
     path("<int:pk>/reprocess/", scans.scan_reprocess, name="scan-reprocess"),
 ]
 rig_urls = [
@@ -53,6 +55,14 @@ rig_urls = [
     path("<slug:slug>/resume/", rigs.queue_resume, name="queue-resume"),
     path("<slug:slug>/lock/", rigs.queue_lock, name="queue-lock"),
     path("<slug:slug>/unlock/", rigs.queue_unlock, name="queue-unlock"),
+    path("<slug:slug>/stop/", rigs.queue_stop, name="queue-stop"),
+    path("<slug:slug>/cart/", rigs.queue_cart, name="queue-cart"),
+]
+again_urls = [
+    path("", again.again_page, name="again"),
+    path("<int:pk>/", again.batch_page, name="again-batch"),
+    path("<int:pk>/cancel/", again.batch_cancel, name="again-cancel"),
+    path("<int:pk>/resume/", again.batch_resume, name="again-resume"),
 ]
 rule_urls = [
     path("calibrations/", calibrations.calibrations_page, name="calibrations"),
@@ -82,6 +92,7 @@ urlpatterns: list[URLPattern | URLResolver] = [
     path("inspections/<int:pk>/", scans.inspection_page, name="inspection"),
     path("scans/", include(scan_urls)),
     path("rigs/", include(rig_urls)),
+    path("again/", include(again_urls)),
     path("", include(rule_urls)),
     path("schedules/", schedules.schedules_page, name="schedules"),
     path("schedules/new/", schedules.schedule_new, name="schedule-new"),

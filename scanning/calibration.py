@@ -278,10 +278,13 @@ def calibrate(
             )
     with np.errstate(all="ignore"):
         fit = fit_line(columns_px, heights_mm)
-    residuals_um = 1000.0 * fit.residuals
-    left_out_um = 1000.0 * fit.leave_one_out
+        residuals_um = 1000.0 * fit.residuals
+        left_out_um = 1000.0 * fit.leave_one_out
     if fit.slope == 0.0 or not (math.isfinite(fit.slope) and math.isfinite(fit.u_slope)):
         raise BadInput(f"{where}: no line fits (slope {fit.slope} mm/px); check that heights are in mm, columns in px")
+    if not np.isfinite(left_out_um).all():
+        alone = int(np.flatnonzero(~np.isfinite(left_out_um))[0]) + 1
+        raise BadInput(f"{where}: pair {alone} lies so far from all others that it alone makes the line; check it")
     if abs(fit.slope) > STEEPEST_MM_PER_PX:
         raise BadInput(
             f"{where}: the slope is {fit.slope:.4g} mm per px, which no laser line scanner has; "

@@ -24,7 +24,8 @@ from inspection.services.ring import COMPUTE_QUEUE, broker_options
 #: The tick is late at worst by this; a second one waiting behind a busy worker says nothing new.
 TICK_EVERY_S = 60.0
 #: Dead workers are found this often: with the lease it bounds how long a scan shows "running" though nobody runs it.
-SWEEP_EVERY_S = 10.0
+SWEEP_EVERY_S = 3.0
+MAKE_ROOM_EVERY_S = 6 * 3600.0
 
 app = Celery("worker", broker=settings.REDIS_URL)
 app.conf.update(
@@ -48,7 +49,12 @@ app.conf.update(
         "sweep": {
             "task": "worker.sweep",
             "schedule": SWEEP_EVERY_S,
-            "options": {"queue": COMPUTE_QUEUE, "expires": SWEEP_EVERY_S - 1.0},
+            "options": {"queue": COMPUTE_QUEUE, "expires": SWEEP_EVERY_S * 3.0},
+        },
+        "make room": {
+            "task": "worker.make_room",
+            "schedule": MAKE_ROOM_EVERY_S,
+            "options": {"queue": COMPUTE_QUEUE, "expires": MAKE_ROOM_EVERY_S},
         },
     },
 )

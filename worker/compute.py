@@ -10,16 +10,21 @@ from __future__ import annotations
 import datetime as dt
 import logging
 import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from celery.exceptions import SoftTimeLimitExceeded
 from django.conf import settings
+from django.db import DatabaseError, connection
 from django.db.models import F
 from django.utils import timezone
 
 from inspection.models import RangeImage as RangeImageRow
 from inspection.models import Recipe, Recomputation, Scan
+from inspection.services.again import ring_next
 from inspection.services.calibrations import calibration_of
 from inspection.services.recipes import recipe_of
 from inspection.services.results import baseline_for, pending_range_file, record_result
@@ -31,7 +36,7 @@ from scanning.range_image import RangeImage
 from scanning.stacks import open_stack
 from scanning.surface import InspectionSettings, inspect_surface
 from worker.celery import app
-from worker.lease import Lease, LeaseLostError, claim_computing
+from worker.lease import BEAT_S, LEASE_S, Lease, LeaseLostError, claim_computing, drop_connection
 
 log = logging.getLogger(__name__)
 
@@ -39,8 +44,6 @@ log = logging.getLogger(__name__)
 MOST_ATTEMPTS = 3
 #: 1205 steps of five exposures take under a minute; an hour is a machine that is swapping.
 SOFT_LIMIT_S, HARD_LIMIT_S = 3600, 3660
-#: A recomputation without an end for longer than its time limit has lost its worker.
-RECOMPUTATION_LOST = dt.timedelta(seconds=HARD_LIMIT_S + 60)
 
 LIMITS: dict[str, Any] = {
     "acks_late": True,
@@ -108,8 +111,13 @@ def recompute(recomputation_id: int) -> None:
     now = timezone.now()
     orders = Recomputation.objects.filter(pk=recomputation_id)
     fresh = orders.filter(state=Recomputation.State.QUEUED)
-    lost = orders.filter(state=Recomputation.State.RUNNING, started_at__lt=now - RECOMPUTATION_LOST)
-    started = {"state": Recomputation.State.RUNNING, "started_at": now, "attempts": F("attempts") + 1}
+    lost = orders.filter(state=Recomputation.State.RUNNING, lease_until__lt=now)
+    started = {
+        "state": Recomputation.State.RUNNING,
+        "started_at": now,
+        "lease_until": now + dt.timedelta(seconds=LEASE_S),
+        "attempts": F("attempts") + 1,
+    }
     if not fresh.update(**started) and not lost.update(**started):
         return
     order = orders.select_related(
@@ -118,12 +126,44 @@ def recompute(recomputation_id: int) -> None:
     try:
         if order.attempts > MOST_ATTEMPTS:
             raise BadInput(f"Computing was started {MOST_ATTEMPTS} times and never came to an end; see the log.")
-        compute(order.scan, order.recipe, recomputation=order)
+        with _beating(order):
+            compute(order.scan, order.recipe, recomputation=order)
     except Fault as fault:
         _fail(order, str(fault))
     except (Exception, SoftTimeLimitExceeded) as error:
         log.exception("Recomputation %s failed.", order.pk)
         _fail(order, f"{type(error).__name__}: {error}")
+
+    finally:
+        if order.batch_id is not None:
+            ring_next(order.batch_id, 1)
+
+
+@contextmanager
+def _beating(order: Recomputation) -> Iterator[None]:
+    """Show from a thread of its own that the order is being worked on, so that one whose worker was killed is found."""
+    enough = threading.Event()
+
+    def beat() -> None:
+        try:
+            while not enough.wait(BEAT_S):
+                try:
+                    Recomputation.objects.filter(pk=order.pk, state=Recomputation.State.RUNNING).update(
+                        lease_until=timezone.now() + dt.timedelta(seconds=LEASE_S)
+                    )
+                except DatabaseError as error:
+                    log.warning("Could not renew the lease on recomputation %s: %s", order.pk, error)
+                    drop_connection()
+        finally:
+            connection.close()
+
+    thread = threading.Thread(target=beat, name=f"lease of recomputation {order.pk}", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        enough.set()
+        thread.join()
 
 
 def _fail(order: Recomputation, fault: str) -> None:

@@ -39,6 +39,15 @@ class LeaseLostError(Exception):
     """Somebody else has taken the scan over, or nobody knows any more that we hold it. Park, and write nothing."""
 
 
+def drop_connection() -> None:
+    """Let the next query connect anew. A server that was restarted has cut the old connection, which stays cut.
+
+    Django does this between requests only, and a scan is one long task.
+    """
+    if not connection.in_atomic_block:
+        connection.close()
+
+
 class Lease:
     """A held scan. ``clock`` (monotonic seconds) judges by itself when a database that does not answer has cost it."""
 
@@ -71,6 +80,7 @@ class Lease:
                 Rig.objects.filter(pk=self._rig_id).update(worker_seen_at=timezone.now())
         except DatabaseError as error:
             log.warning("Could not renew the lease on scan %s: %s", self.scan_id, error)
+            drop_connection()
             return
         if held:
             self._renewed_at = now

@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 #: How often the worker shows that it is there, and looks after scans of its rig that a dead predecessor left.
 SEEN_EVERY_S = 10.0
-LOOK_EVERY_S = 5.0
+LOOK_EVERY_S = 1.0
 QUEUE_PREFIX = rig_queue("")
 
 

@@ -8,11 +8,12 @@ the frames taken so far on the disk, and a sentence in the row that says what a 
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,8 @@ from scanning.rig.protocols import Frame, SensorMode
 from scanning.rig.rig import Rig, open_rig
 from scanning.rig.session import AcquisitionSummary, Order, ScanPlan, acquire
 from scanning.stacks import PART_SUFFIX, StackWriter, open_stack
-from worker.lease import Lease, LeaseLostError
+from worker.emergency import EmergencyStopped, StopLine
+from worker.lease import Lease, LeaseLostError, drop_connection
 from worker.live import LiveRangeImage
 from worker.stopping import Watch
 
@@ -87,6 +89,7 @@ class Orders:
             self._show(order)
         except DatabaseError as error:
             log.warning("Scan %s goes on without the database: %s", self._lease.scan_id, error)
+            drop_connection()
             return self._last
         self._last = order
         return order
@@ -94,12 +97,14 @@ class Orders:
     def _asked(self) -> Order:
         row = (
             Scan.objects.filter(pk=self._lease.scan_id, lease_token=self._lease.token)
-            .values_list("cancel_requested_at", "finish_requested_at", "pause_requested_at")
+            .values_list("cancel_requested_at", "finish_requested_at", "pause_requested_at", "stop_requested_at")
             .first()
         )
         if row is None:
             raise LeaseLostError(f"scan {self._lease.scan_id} was taken over")
-        cancel, finish, pause = row
+        cancel, finish, pause, stop = row
+        if stop:
+            raise EmergencyStopped
         return "cancel" if cancel else "finish" if finish else "pause" if pause else "run"
 
     def _show(self, order: Order) -> None:
@@ -128,6 +133,7 @@ class Frames:
         self._calibration = calibration
         self._writer: StackWriter | None = None
         self._image: LiveRangeImage | None = None
+        self._replayed: StackHeader | None = None
         self._lock = threading.Lock()
         self.done = 0
 
@@ -143,6 +149,43 @@ class Frames:
         self._image.push(images)
         with self._lock:
             self.done = step + 1
+
+    def replay(self, earlier: Path, steps: int, check: Callable[[], None]) -> int:
+        """Take over the whole frames of a recording that broke off; return how many steps of ``steps`` they are.
+
+        Every frame passes its checksum or is taken again by the rig: the first that does not ends the replay. The new
+        part is on the disk when this returns, so that the earlier file can go.
+        """
+        with open_stack(earlier) as stack:
+            header = replace(stack.header, steps=steps)
+            for index in range(min(stack.header.steps, steps)):
+                try:
+                    images = stack.step(index)
+                except BadInput as damaged:
+                    log.warning("%s; the scan goes on from there.", damaged)
+                    break
+                if self._writer is None:
+                    self._writer = StackWriter(self._place, header)
+                    self._image = LiveRangeImage(self._recipe, header, self._calibration)
+                self._writer.append(images)
+                assert self._image is not None
+                self._image.push(images)
+                self.done = index + 1
+                check()
+        if self._writer is not None:
+            self._replayed = header
+            with self._writer.part.open("rb") as part:
+                os.fsync(part.fileno())
+        return self.done
+
+    def check_header(self) -> None:
+        """Refuse to add frames of another kind to those replayed; a stack has one header."""
+        if self._replayed is not None and (now := self._header()) != self._replayed:
+            different = [name for name, value in asdict(now).items() if value != asdict(self._replayed)[name]]
+            raise BadInput(
+                f"The rig has changed since the scan broke off ({', '.join(different)}), so its frames would not fit; "
+                f"scan the region again."
+            )
 
     def finish_image(self) -> LiveRangeImage:
         if self._image is None:
@@ -176,7 +219,12 @@ class _Run:
         self.scan = scan
         self.opening = opening
         self.watch = watch
-        self.place = f"{timezone.now():%Y/%m}/scan-{scan.pk}.h5"
+        suffix = f"-{scan.continued}" if scan.continued else ""
+        self.place = f"{timezone.now():%Y/%m}/scan-{scan.pk}{suffix}.h5"
+        #: The frames to go on from; "" once they are taken over.
+        self.earlier = scan.stack_file if scan.continued else ""
+        self.first_step = 0
+        self.line: StopLine | None = None
         self.frames: Frames | None = None
         self.orders: Orders | None = None
 
@@ -191,8 +239,15 @@ class _Run:
 
     def _scan(self) -> str:
         try:
-            summary = self._acquire()
+            summary = self._acquired()
             return self._hand_over(summary)
+        except EmergencyStopped:
+            who = self._stopped_by()
+            return self._end(
+                ScanState.INTERRUPTED,
+                f"Emergency stop{f' by {who}' if who else ''} at step {self._done()} of {self.scan.total}: the stage "
+                f"was halted, the laser is off. Look at the rig, then continue the scan or resume the queue.",
+            )
         except Stopped:
             return self._end(ScanState.CANCELLED, "")
         except WorkerGoingDown as reason:
@@ -222,20 +277,70 @@ class _Run:
     def _done(self) -> int:
         return self.frames.done if self.frames is not None else 0
 
+    def _stopped_by(self) -> str:
+        by = Scan.objects.select_related("stop_requested_by").get(pk=self.scan.pk).stop_requested_by
+        return str(by) if by else ""
+
+    def _acquired(self) -> AcquisitionSummary:
+        """`_acquire`, with whatever an emergency stop made of it called by its name."""
+        try:
+            return self._acquire()
+        except (LeaseLostError, EmergencyStopped):
+            raise
+        except Exception as error:
+            if self.line is not None and self.line.pressed:
+                raise EmergencyStopped from error
+            raise
+
     def _acquire(self) -> AcquisitionSummary:
         scan, plan = self.scan, self.scan.plan
         recipe, calibration = recipe_of(scan.recipe), calibration_of(scan.calibration)
         target = Path(settings.STACKS) / self.place
         if target.exists():
             raise BadInput(f"There is already a stack {self.place}; move it away, then scan again.")
+        opened: list[Rig] = []
+        self.frames = Frames(target, lambda: header_of(scan.rig, plan, opened[0], calibration), recipe, calibration)
+        if self.earlier:
+            self._take_over()
         # The row names the part before there is one, so that a killed worker's frames are found.
-        self.lease.write(stack_file=self.place + PART_SUFFIX, total=plan["steps"])
+        self.lease.write(stack_file=self.place + PART_SUFFIX, total=plan["steps"], done=self.first_step)
+        if self.earlier:
+            (Path(settings.STACKS) / self.earlier).unlink(missing_ok=True)
+            self.earlier = ""
+        if self.first_step == plan["steps"]:  # it broke off between the last frame and the hand-over
+            return AcquisitionSummary(steps_done=self.first_step)
         config = {part: scan.rig.config[part] for part in HARDWARE if part in scan.rig.config}
         with self.opening({"name": scan.rig.name, **config}) as rig:
+            opened.append(rig)
             put_part_on(rig, plan)
-            self.frames = Frames(target, lambda: header_of(scan.rig, plan, rig, calibration), recipe, calibration)
+            self.frames.check_header()
             self.orders = Orders(self.lease, self._done, watch=self.watch)
-            return acquire(rig, scan_plan(scan.rig, plan), on_frames=self.frames.take, control=self.orders)
+            with StopLine(self.lease, rig.stage) as self.line:
+                return acquire(
+                    rig,
+                    replace(scan_plan(scan.rig, plan), first_step=self.first_step),
+                    on_frames=self.frames.take,
+                    control=self.orders,
+                )
+
+    def _take_over(self) -> None:
+        """Verify the frames of the recording that broke off and copy them into the new one."""
+        assert self.frames is not None
+
+        def check() -> None:
+            self.lease.check()
+            if reason := self.watch.reason():
+                raise WorkerGoingDown(reason)
+
+        self.lease.write(phase="verifying")
+        try:
+            self.first_step = self.frames.replay(
+                Path(settings.STACKS) / self.earlier, int(self.scan.plan["steps"]), check
+            )
+        except BadInput as unreadable:
+            if self.frames.done:
+                raise
+            log.warning("Scan %s starts clean: %s", self.scan.pk, unreadable)
 
     def _hand_over(self, summary: AcquisitionSummary) -> str:
         """The last frame is in and the rig is parked: the range image to its file, the scan to the compute workers."""
@@ -262,7 +367,10 @@ class _Run:
                 progress_at=now,
                 stack_file=self.place,
                 stack_sha256=sha256,
-                acquisition=described(summary),
+                acquisition={
+                    **described(summary),
+                    **({"continued_at_step": self.first_step} if self.scan.continued else {}),
+                },
                 lease_token=None,
                 lease_until=None,
                 attempts=0,
@@ -310,6 +418,10 @@ class _Run:
 
     def _keep(self) -> dict[str, str]:
         """Complete the stack of an ended scan; the row's columns about it."""
+        if self.earlier:  # not taken over yet: the new part is of no use, the earlier frames stay what there is
+            self._close()
+            (Path(settings.STACKS) / (self.place + PART_SUFFIX)).unlink(missing_ok=True)
+            return {"stack_file": self.earlier}
         if self._done() == 0 or self.frames is None:
             self._close()
             part = Path(settings.STACKS) / (self.place + PART_SUFFIX)

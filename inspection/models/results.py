@@ -111,6 +111,24 @@ class PrecisionReport(InsertOnly):
         return f"precision of range image {self.range_image_id}"
 
 
+class RecomputationBatch(models.Model):
+    """Many scans to be computed again with one recipe. How far it is stands in its orders, nowhere else."""
+
+    recipe = models.ForeignKey(Recipe, on_delete=models.PROTECT, related_name="+")
+    reason = models.CharField(max_length=200)
+    requested_by = models.ForeignKey(settings.AUTH_USER_MODEL, null=True, on_delete=models.PROTECT, related_name="+")
+    requested_at = models.DateTimeField()
+
+    class Meta:
+        ordering = ["-requested_at", "-pk"]
+
+    def __str__(self) -> str:
+        return f"batch {self.pk} with {self.recipe}"
+
+    def get_absolute_url(self) -> str:
+        return reverse("again-batch", args=[self.pk])
+
+
 class Recomputation(models.Model):
     """An order to compute a scan's result again with a recipe. The row is the order; the message only rings for it."""
 
@@ -119,14 +137,17 @@ class Recomputation(models.Model):
         RUNNING = "running"
         DONE = "done"
         FAILED = "failed"
+        CANCELLED = "cancelled"
 
     scan = models.ForeignKey(Scan, on_delete=models.PROTECT, related_name="recomputations")
     recipe = models.ForeignKey(Recipe, on_delete=models.PROTECT, related_name="+")
     requested_by = models.ForeignKey(settings.AUTH_USER_MODEL, null=True, on_delete=models.PROTECT, related_name="+")
     requested_at = models.DateTimeField()
-    state = models.CharField(max_length=8, choices=State, default=State.QUEUED)
+    batch = models.ForeignKey(RecomputationBatch, null=True, on_delete=models.PROTECT, related_name="orders")
+    state = models.CharField(max_length=9, choices=State, default=State.QUEUED)
     attempts = models.PositiveIntegerField(default=0)
     started_at = models.DateTimeField(null=True, blank=True)
+    lease_until = models.DateTimeField(null=True, blank=True, help_text="Its worker is alive until then.")
     finished_at = models.DateTimeField(null=True, blank=True)
     fault = models.CharField(max_length=500, blank=True)
     range_image = models.OneToOneField(
@@ -135,7 +156,10 @@ class Recomputation(models.Model):
 
     class Meta:
         ordering = ["-requested_at", "-pk"]
-        indexes = [models.Index(fields=["state", "requested_at"])]  # the tick's list of what still waits
+        indexes = [
+            models.Index(fields=["state", "requested_at"]),  # the tick's list of what still waits
+            models.Index(fields=["batch", "state"]),  # a batch's progress
+        ]
 
     def __str__(self) -> str:
         return f"{self.scan} again with {self.recipe}"

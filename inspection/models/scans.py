@@ -78,11 +78,19 @@ class Scan(models.Model):
     )
     pause_requested_at = models.DateTimeField(null=True, blank=True)
     finish_requested_at = models.DateTimeField(null=True, blank=True)
+    stop_requested_at = models.DateTimeField(null=True, blank=True, help_text="Emergency stop: looked at 40 times a s.")
+    stop_requested_by = models.ForeignKey(
+        settings.AUTH_USER_MODEL, null=True, blank=True, on_delete=models.SET_NULL, related_name="+"
+    )
+    continued = models.PositiveIntegerField(default=0, help_text="How often it went on after it had been interrupted.")
 
     fault = models.CharField(max_length=500, blank=True, help_text="One sentence: why it failed.")
     partial = models.BooleanField(default=False)
     stack_file = models.CharField(max_length=300, blank=True, help_text="Below the stacks folder.")
     stack_sha256 = models.CharField(max_length=64, blank=True)
+    stack_removed_at = models.DateTimeField(
+        null=True, blank=True, help_text="When the retention rule took the raw frames away; results stay."
+    )
     acquisition = models.JSONField(default=dict, help_text="Time budget and link quality of the run.")
 
     class Meta:

@@ -113,7 +113,10 @@ def seconds_per_step(rig: Rig) -> float | None:
     paces = [
         run.acquisition["duration_s"] / run.done
         for run in runs
-        if run.acquisition and run.acquisition.get("duration_s") and not run.acquisition.get("pauses")
+        if run.acquisition
+        and run.acquisition.get("duration_s")
+        and not run.acquisition.get("pauses")
+        and not run.acquisition.get("continued_at_step")
     ]
     return median(paces) if paces else None
 

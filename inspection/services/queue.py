@@ -71,6 +71,7 @@ def enqueue_inspection(
         inspection = Inspection.objects.create(
             tool=tool, requested_by=by, requested_at=now, reason=reason[:200], life_used=tool.life_used
         )
+        Rig.objects.select_for_update().get(pk=rig.pk)  # two orders at once stay two blocks, not one woven from both
         position = _last_position(rig)
         for offset, (region, plan) in enumerate(zip(chosen, plans, strict=True), start=1):
             _create_scan(inspection, region, rig, recipe, plan, position + offset, by)
@@ -311,6 +312,7 @@ def scan_again(scan: Scan, by: User | None) -> Scan:
         raise BadInput(f"{scan.rig.name} is out of service; order the scan on another rig.")
     check_recipe(scan.recipe, scan.plan, str(scan.region))
     with transaction.atomic():
+        Rig.objects.select_for_update().get(pk=scan.rig_id)
         first = scan.rig.scans.filter(state=ScanState.QUEUED).aggregate(first=Min("position"))["first"]
         again = _create_scan(
             scan.inspection, scan.region, scan.rig, scan.recipe, dict(scan.plan), (first or 1.0) - 1.0, by

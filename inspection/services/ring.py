@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from functools import cache, partial
 
-from celery import Celery
+from celery import Celery, group
 from django.conf import settings
 from django.db import transaction
 
@@ -18,6 +18,10 @@ log = logging.getLogger(__name__)
 #: A ring older than this says nothing that the tick has not said meanwhile.
 RING_EXPIRES_S = 120
 COMPUTE_QUEUE = "compute"
+#: Served by the same workers, in turn with the other: a fresh scan waits behind one old one, not behind a thousand.
+AGAIN_QUEUE = "again"
+#: An order of a batch may wait in line this long before it is rung for again.
+AGAIN_EXPIRES_S = 600
 
 #: Fail within a second or two when the broker is away: a person is waiting for the page.
 TRANSPORT_OPTIONS = {
@@ -71,11 +75,28 @@ def ring_measure(scan_id: int) -> None:
 
 def ring_recompute(recomputation_id: int) -> None:
     """Ask the compute workers to do a `Recomputation`, once the current transaction is committed."""
-    _on_commit("worker.recompute", [recomputation_id], COMPUTE_QUEUE)
+    ring_recompute_many([recomputation_id])
+
+
+def ring_recompute_many(recomputation_ids: list[int]) -> None:
+    """Spread several `Recomputation`s over the compute workers as one Celery group, after the commit."""
+    if recomputation_ids:
+        transaction.on_commit(partial(_send_group, "worker.recompute", recomputation_ids, AGAIN_QUEUE), robust=True)
 
 
 def _on_commit(task: str, arguments: list[object], queue: str) -> None:
     transaction.on_commit(partial(_send, task, arguments, queue), robust=True)
+
+
+def _send_group(task: str, arguments: list[int], queue: str) -> None:
+    try:
+        sender = _sender()
+        group(
+            sender.signature(task, args=[one], queue=queue, expires=AGAIN_EXPIRES_S, ignore_result=True)
+            for one in arguments
+        ).apply_async(add_to_parent=False)
+    except Exception as error:  # whatever the transport raises, the change itself stands
+        log.warning("Could not ring %s %s (%s); the tick will.", task, arguments, error)
 
 
 def _send(task: str, arguments: list[object], queue: str) -> None:

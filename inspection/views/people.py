@@ -9,12 +9,14 @@ from django.http import HttpResponse
 from django.shortcuts import redirect, render
 from django.views.decorators.http import require_safe
 
-from inspection.forms.people import PersonForm
+from inspection.forms.people import PersonForm, SignInForm
 from inspection.models import Role, User
 from inspection.services.audit import audit
 from inspection.views.signed_in import SignedIn, form_page, found, said
 
-sign_in = LoginView.as_view(template_name="people/sign_in.html", redirect_authenticated_user=True)
+sign_in = LoginView.as_view(
+    template_name="people/sign_in.html", authentication_form=SignInForm, redirect_authenticated_user=True
+)
 sign_out = LogoutView.as_view()
 
 ROLE_WORDS = {

@@ -9,10 +9,13 @@ from django.http import HttpResponse
 from django.shortcuts import redirect, render
 from django.views.decorators.http import require_POST, require_safe
 
+from inspection.forms.again import CartForm
 from inspection.models import Rig, Scan
 from inspection.selectors.queue import queue_view
 from inspection.services import queue
-from inspection.views.signed_in import SignedIn, found
+from inspection.services.carts import order_cart
+from inspection.services.emergency import emergency_stop
+from inspection.views.signed_in import SignedIn, form_page, found, refused, said
 from scanning.errors import Fault
 
 #: Where a waiting scan can go, the icon, and what its button says.
@@ -88,6 +91,38 @@ def queue_resume(request: SignedIn, slug: str) -> HttpResponse:
 def queue_lock(request: SignedIn, slug: str) -> HttpResponse:
     rig = found(Rig, slug=slug)
     return _answer(request, rig, lambda: queue.lock_rig(rig, request.user, request.POST.get("note", "")))
+
+
+@require_POST
+def queue_stop(request: SignedIn, slug: str) -> HttpResponse:
+    """The emergency stop. It never answers with a refusal: pressed twice, it has been pressed."""
+    rig = found(Rig, slug=slug)
+    if emergency_stop(rig, request.user):
+        messages.error(request, "Emergency stop: the stage is halted and the laser goes off. Look at the rig.")
+    else:
+        messages.error(request, "Emergency stop: no scan was on the rig; its queue is paused.")
+    if request.htmx:
+        response = HttpResponse(status=204)
+        response["HX-Refresh"] = "true"
+        return response
+    return redirect(rig)
+
+
+def queue_cart(request: SignedIn, slug: str) -> HttpResponse:
+    """Order a cart of tools."""
+    rig = found(Rig, slug=slug)
+    form = CartForm(request.POST or None)
+    if request.method == "POST" and form.is_valid():
+        try:
+            visits = order_cart(
+                codes=form.cleaned_data["codes"].split(), rig=rig, by=request.user, reason=form.cleaned_data["reason"]
+            )
+        except Fault as fault:
+            refused(form, fault)
+        else:
+            said(request, f"Queued on {rig}: {', '.join(visit.tool.code for visit in visits)}.")
+            return redirect(rig)
+    return form_page(request, "rig/cart.html", form, rig=rig)
 
 
 @require_POST

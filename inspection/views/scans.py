@@ -15,6 +15,7 @@ from inspection.selectors.range_view import CHANNELS, check_same_pitch
 from inspection.selectors.scan import ScanPage, comparable, progress, progress_version, scan_state
 from inspection.selectors.tool import key_numbers, numbers
 from inspection.services import queue
+from inspection.services.continuing import can_continue, continue_scan
 from inspection.views.signed_in import SignedIn, back_with_fault, found, said
 from scanning.errors import Fault
 
@@ -51,6 +52,7 @@ def scan_page(request: SignedIn, pk: int) -> HttpResponse:
         "start_mm": scan.plan.get("start_mm", scan.region.start_mm),
         "fixed_um": _fixed_scale_um(page),
         "recipes": Recipe.objects.all() if scan.has_ended and scan.stack_file else [],
+        "can_continue": can_continue(scan),
         "siblings": scan.inspection.scans.select_related("region").order_by("region__name", "pk"),
     }
     return render(request, "scan/scan.html", context)
@@ -114,6 +116,18 @@ def scan_resume(request: SignedIn, pk: int) -> HttpResponse:
 def scan_finish(request: SignedIn, pk: int) -> HttpResponse:
     return _asked(
         request, pk, queue.finish_early, "Finishing early: what was scanned so far is kept and marked partial."
+    )
+
+
+@require_POST
+def scan_continue(request: SignedIn, pk: int) -> HttpResponse:
+    """Go on with a scan that broke off; the box says that somebody has looked at the rig."""
+    looked = request.POST.get("looked") == "1"
+    return _asked(
+        request,
+        pk,
+        lambda scan, by: continue_scan(scan, by, looked=looked),
+        "It goes on where it broke off, first in the queue: the frames are verified and the stage homes again.",
     )
 
 

@@ -17,6 +17,9 @@ from scanning.errors import Fault
 
 M = TypeVar("M", bound=Model)
 
+#: The largest number a row can have, in either kind of database.
+LARGEST_KEY = 2**63 - 1
+
 
 class SignedIn(HttpRequest):
     """A request that the role gate let through, so its user is one of ours."""
@@ -50,6 +53,8 @@ def found(rows: QuerySet[M] | type[M], **lookup: Any) -> M:
     """The one row, or a 404 that says what was looked for."""
     queryset: QuerySet[M] = rows if isinstance(rows, QuerySet) else rows._default_manager.all()
     try:
+        if any(isinstance(value, int) and value > LARGEST_KEY for value in lookup.values()):
+            raise ObjectDoesNotExist  # no database could even be asked for it
         return queryset.get(**lookup)
     except ObjectDoesNotExist:
         what = queryset.model._meta.verbose_name

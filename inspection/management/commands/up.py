@@ -171,7 +171,7 @@ class Command(BaseCommand):
             Child(
                 "compute worker",
                 [
-                    *celery, "worker", "--pool", "prefork", "--concurrency", "1", "--queues", "compute",
+                    *celery, "worker", "--pool", "prefork", "--concurrency", "1", "--queues", "compute,again",
                     "--hostname", "compute@%h", "--without-gossip", "--without-mingle", "--loglevel", "INFO",
                 ],
                 self.logs / "compute.log",
