@@ -90,7 +90,7 @@ def compared(seed: int) -> tuple[dict[str, list[Compared]], dict[str, int], dict
         rows[name] = []
         for i, true in enumerate(truths):
             mine = [report.damages[k] for k in ours.get(i, [])]
-            one = max(mine, key=lambda d: d.volume_mm3) if mine else None
+            best = max(mine, key=lambda d: d.volume_mm3) if mine else None
             nan = float("nan")
             rows[name].append(
                 Compared(
@@ -98,10 +98,10 @@ def compared(seed: int) -> tuple[dict[str, list[Compared]], dict[str, int], dict
                     reach_um=1e3 * true["reach_mm"],
                     depth_um=true["depth_um"],
                     volume_mm3=true["volume_mm3"],
-                    found_depth_um=one.depth_um if one else nan,
-                    u_depth_um=one.u_depth_um if one else nan,
-                    found_volume_mm3=one.volume_mm3 if one else nan,
-                    u_volume_mm3=one.u_volume_mm3 if one else nan,
+                    found_depth_um=best.depth_um if best else nan,
+                    u_depth_um=best.u_depth_um if best else nan,
+                    found_volume_mm3=best.volume_mm3 if best else nan,
+                    u_volume_mm3=best.u_volume_mm3 if best else nan,
                 )
             )
     return rows, false, reports

@@ -17,7 +17,7 @@ a whole tread does the rest."""
 def range_image_of(path: Path, recipe_name: str) -> RangeImage:
     """Process the stack at ``path`` with a recipe by name, or with `GAUGE_RECIPE`."""
     from scanning.pipeline import warm_up
-    from scanning.pipeline.stream import process_stack
+    from scanning.pipeline.whole import process_stack
     from scanning.stacks import open_stack
 
     with open_stack(path) as stack:

@@ -55,13 +55,13 @@ def by_light(lost_um: Float32, light: Float32, sound: Mask, row_pitch_um: float,
         return ones
     middle = float(np.median(level[usable]))
     excess = ones.copy() - 1.0
-    for measure, start in ((level, middle), (change, 0.0)):
+    for measure, start in ((level, middle), (np.asarray(change, dtype=np.float32), 0.0)):
         excess += np.square(_by(measure, start, lost_um, usable, overall)) - 1.0
     ratio = np.sqrt(1.0 + excess)
     return np.where(usable, np.clip(ratio, 1.0, MOST), np.float32(1.0)).astype(np.float32)
 
 
-def _by(measure: Float32 | Float64, start: float, lost_um: Float32, usable: Mask, overall: float) -> Float64:
+def _by(measure: Float32, start: float, lost_um: Float32, usable: Mask, overall: float) -> Float64:
     """The ratio at every pixel, growing away from ``start`` to both sides."""
     values = measure[usable].astype(np.float64)
     lost = lost_um[usable]
@@ -81,7 +81,7 @@ def _by(measure: Float32 | Float64, start: float, lost_um: Float32, usable: Mask
                 ratio[i] = last = max(last, ratio[i]) if np.isfinite(ratio[i]) else last
     if place.size == 0:
         return np.ones(measure.shape)
-    return np.interp(np.nan_to_num(measure, nan=start), place, ratio)
+    return np.asarray(np.interp(np.nan_to_num(measure, nan=start), place, ratio), dtype=np.float64)
 
 
 def _other_side(lost_um: Float32) -> float:
