@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import sys
 
-from benchmarks import acquisition, damage, precision
+from benchmarks import acquisition, coverage, damage, precision
 
-QUESTIONS = {"precision": precision.main, "damage": damage.main, "acquisition": acquisition.main}
+QUESTIONS = {
+    "precision": precision.main,
+    "damage": damage.main,
+    "coverage": coverage.main,
+    "acquisition": acquisition.main,
+}
 
 
 def main() -> int:

@@ -14,7 +14,7 @@ from scanning.optics import IS1, LINE_WIDTH_UM
 from scanning.pipeline.stream import Profile, ProfileStream, heights_um
 from scanning.range_image import RangeImage
 from scanning.rig.simulated.render import Renderer
-from scanning.rig.simulated.scenes import STEP_UM, scene
+from scanning.rig.simulated.scenes import STEP_UM, Scene, scene
 from scanning.surface import SurfaceReport, inspect_surface
 
 SEEDS = (5101, 5102, 5103)
@@ -33,17 +33,16 @@ def recipe_named(name: str) -> Recipe:
     return recipe if sliding else recipe.with_settings({"sci.mode": "sliding"})
 
 
-def measured(region: str, seed: int) -> tuple[dict[str, SurfaceReport], list[float]]:
-    """Scan one region once, inspect it with every recipe; also the true damages' places along the edge, in mm."""
-    part = scene(region, seed=seed, wear_um=WEAR_UM, visit=1)
+def inspected(part: Scene, seed: int, recipes: tuple[str, ...] = RECIPES) -> dict[str, SurfaceReport]:
+    """Scan a part once and inspect it with every recipe."""
     renderer = Renderer(part, rows=ROWS, columns=COLUMNS)
     header = StackHeader(
         rows=ROWS, columns=COLUMNS, steps=STEPS, exposures_us=EXPOSURES_US, step_um=STEP_UM,
         row_pitch_um=IS1.row_pitch_um, mm_per_pixel=IS1.mm_per_pixel, saturation=renderer.sensor.saturation,
         line_width_px=IS1.on_sensor_px(LINE_WIDTH_UM),
     )  # fmt: skip
-    streams = {name: ProfileStream(recipe_named(name), header) for name in RECIPES}
-    profiles: dict[str, list[Profile]] = {name: [] for name in RECIPES}
+    streams = {name: ProfileStream(recipe_named(name), header) for name in recipes}
+    profiles: dict[str, list[Profile]] = {name: [] for name in recipes}
     for step in range(STEPS):
         light = renderer.irradiance(step * STEP_UM)
         images = [
@@ -56,7 +55,7 @@ def measured(region: str, seed: int) -> tuple[dict[str, SurfaceReport], list[flo
     for name, stream in streams.items():
         profiles[name] += stream.finish()
         reports[name] = inspect_surface(_image(profiles[name], header))
-    return reports, [float(one["position_mm"]) for one in part.damage_truths()]
+    return reports
 
 
 def _image(profiles: list[Profile], header: StackHeader) -> RangeImage:
@@ -81,7 +80,8 @@ def main(arguments: list[str]) -> int:
     print("|---|---|---|---|---|---|---|---|")
     for seed in SEEDS:
         for region in REGIONS:
-            reports, places = measured(region, seed)
+            part = scene(region, seed=seed, wear_um=WEAR_UM, visit=1)
+            reports, places = inspected(part, seed), [float(one["position_mm"]) for one in part.damage_truths()]
             for name, report in reports.items():
                 # Profile n of a sliding window of five is the middle of steps n to n + 4.
                 late_mm = 2 * STEP_UM * 1e-3

@@ -178,14 +178,18 @@ class Diagonals:
 
     ``angle_deg`` of the triangulation (60 on the paper's rig) gives how far the surface moves on the sensor per step;
     ``px_per_step`` says it outright. ``direction``: to "higher" or "lower" columns; "auto" is seen from the images.
+    ``share`` of the way from the centre of gravity in the image to the one in time; None is seen from the images.
     """
 
     key: ClassVar[str] = "sta"
     angle_deg: float = 60.0
     px_per_step: float | None = None
     direction: str = "auto"
+    share: float | None = None
 
     def __post_init__(self) -> None:
+        if self.share is not None:
+            _number("sta.share", self.share, 0.0, 1.0)
         _number("sta.angle_deg", self.angle_deg, 1.0, 89.0)
         if self.px_per_step is not None:
             _number("sta.px_per_step", self.px_per_step, 0.0, 1e4, above=True)
@@ -450,7 +454,7 @@ _READERS: dict[str, Callable[[str, str], Any]] = {
     "width_px": _read_float_or_default, "width_factor": _read_float, "gate_px": _read_float,
     "gate_max_px": _read_float, "seed": _read_text, "candidates": _read_text, "continuity": _read_text,
     "jump": _read_float, "fewest": _read_int, "angle_deg": _read_float, "px_per_step": _read_float_or_default,
-    "direction": _read_text,
+    "direction": _read_text, "share": _read_float_or_default,
 }  # fmt: skip
 
 

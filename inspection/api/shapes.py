@@ -12,6 +12,8 @@ from typing import Annotated, Any
 from ninja import Field, Schema
 from pydantic import StringConstraints
 
+from scanning.recipe import Recipe
+
 #: A database key: what lies outside cannot exist, and must not reach the database as a number too large for it.
 Id = Annotated[int, Field(ge=1, le=2**63 - 1)]
 #: A word from outside, without control characters that a database refuses.
@@ -195,7 +197,7 @@ class Order(Schema):
     rig: Word = Field(description="The rig's slug.")
     regions: list[Word] | None = Field(None, max_length=200, description="Names; left out: all active regions.")
     recipe: Word | None = Field(
-        None, description="NF, SCI, HDRE-I, HDRE-II, HDR-CAM; left out: what fits the exposures."
+        None, description=f"{', '.join(Recipe.NAMES)}; left out: PRECISE, or HDR-CAM for a logarithmic camera."
     )
     exposures_us: list[float] | None = Field(None, max_length=32, description="Left out: the rig's bracket.")
     reason: Word = ""

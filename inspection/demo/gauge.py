@@ -28,7 +28,7 @@ def gauge_pairs() -> str:
         row_pitch_um=part.system.row_pitch_um, mm_per_pixel=0.0142, saturation=renderer.sensor.saturation,
         line_width_px=3.03,
     )  # fmt: skip
-    stream = ProfileStream(Recipe.named("HDRE-II"), header)
+    stream = ProfileStream(Recipe.named("PRECISE"), header)
     profiles = []
     for step in range(STEPS):
         light = renderer.irradiance(step * STEP_UM)

@@ -23,7 +23,7 @@ from django.utils import timezone
 from inspection.models import Calibration, Inspection, Recipe, Region, Rig, Scan, User
 from inspection.services.audit import audit
 from inspection.services.queue import limits_in_force
-from inspection.services.recipes import recipe_named, recipe_of
+from inspection.services.recipes import recipe_of, recipe_row, usual_recipe
 from inspection.services.ring import ring_measure
 from inspection.states import ScanState
 from scanning import stacks
@@ -66,7 +66,7 @@ def import_stack(
     target = settings.STACKS / place
     with stacks.open_stack(folder) as stack:
         header = stack.header
-        recipe = recipe or recipe_named(_default_recipe(header))
+        recipe = recipe or recipe_row(usual_recipe(header.response, header.steps))
         _check_fits(recipe, header)
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -141,15 +141,6 @@ def _plan(header: StackHeader, region: Region, original_name: str) -> dict[str, 
         "flat_rows": flat_rows if flat_rows >= 3 else header.rows,
         "imported_from": original_name,
     }
-
-
-def _default_recipe(header: StackHeader) -> str:
-    enough = header.steps >= 5
-    if header.response == "logarithmic":
-        return "HDR-CAM" if enough else "NF"
-    if not enough:
-        return "NF"
-    return "HDRE-II" if len(header.exposures_us) > 1 else "SCI"
 
 
 def _check_fits(recipe: Recipe, header: StackHeader) -> None:

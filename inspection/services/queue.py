@@ -16,11 +16,10 @@ from django.db import transaction
 from django.db.models import Max, Min
 from django.utils import timezone
 
-import scanning.recipe
 from inspection.models import Inspection, LimitSet, Recipe, Recomputation, Region, Rig, Scan, Tool, User
 from inspection.services.audit import audit
 from inspection.services.moves import WrongState, move
-from inspection.services.recipes import recipe_named, recipe_of, recipe_row
+from inspection.services.recipes import WINDOW, recipe_named, recipe_of, recipe_row, usual_recipe
 from inspection.services.ring import ring, ring_recompute
 from inspection.states import ENDED, ON_RIG, QueueState, ScanState
 from scanning.errors import BadInput
@@ -135,14 +134,10 @@ def check_exposures(exposures_us: Sequence[float], rig: Rig) -> list[float]:
 
 
 def default_recipe(rig: Rig, exposures_us: Sequence[float]) -> Recipe:
-    """The recipe an order uses when nobody says otherwise: the rig's own, or the paper's best for its exposures."""
+    """The recipe an order uses when nobody says otherwise: the rig's own, or the usual one for its camera."""
     if named := rig.config.get("recipe"):
         return recipe_named(str(named))
-    if exposures_us[0] == 0.0:
-        return recipe_named("HDR-CAM")
-    best = scanning.recipe.Recipe.named("HDRE-II" if len(exposures_us) > 1 else "SCI")
-    # Sliding keeps the step as pitch: damage of a tenth of a millimetre stays visible.
-    return recipe_row(best.with_settings({"sci.mode": "sliding"}))
+    return recipe_row(usual_recipe("logarithmic" if exposures_us[0] == 0.0 else "linear", WINDOW))
 
 
 def plan_for(region: Region, rig: Rig, exposures_us: Sequence[float], recipe: Recipe) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from typing import Any
 
 from scanning.commands.progress import shown
 from scanning.errors import BadInput
+from scanning.recipe import Recipe
 
 NAME = "process"
 HELP = "turn a stack of scan images into a range image and a precision report"
@@ -15,7 +16,7 @@ HELP = "turn a stack of scan images into a range image and a precision report"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("stack", metavar="STACK", type=Path, help="folder with stack.json and images, or an .h5 stack")
-    parser.add_argument("--recipe", required=True, help="NF, SCI, HDRE-I, HDRE-II or HDR-CAM")
+    parser.add_argument("--recipe", required=True, help=f"one of {', '.join(Recipe.NAMES)}")
     parser.add_argument(
         "--set",
         dest="settings",

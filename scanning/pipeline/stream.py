@@ -284,7 +284,14 @@ class ProfileStream:
             if LEAST_SPEED * light_width <= speed <= MOST_SPEED * light_width:
                 direction = {"auto": 0, "higher": 1, "lower": -1}[sta.direction]
                 self._space_time = SpaceTime(
-                    h.rows, h.columns, sci.window, speed, direction, REACH * light_width, *self._chain.single_grey
+                    h.rows,
+                    h.columns,
+                    sci.window,
+                    speed,
+                    direction,
+                    REACH * light_width,
+                    *self._chain.single_grey,
+                    sta.share,
                 )
 
     def provenance(self) -> dict[str, Any]:
@@ -312,6 +319,7 @@ class ProfileStream:
             "candidates": None if settled is None else settled.candidates,
             "continuity": None if settled is None else settled.continuity,
             "space_time_direction": None if self._space_time is None else self._space_time.direction,
+            "space_time_share": None if self._space_time is None else self._space_time.share,
             "estimated": [] if settled is None else list(settled.estimated),
             "notes": notes,
             "versions": {

@@ -34,6 +34,7 @@ from scanning.surface.filters import (
 from scanning.surface.noise import Noise, robust_sigma
 from scanning.surface.settings import InspectionSettings
 from scanning.surface.uncertainty import Budget
+from scanning.surface.uneven import by_light, by_place
 
 Labels = NDArray[np.int32]
 
@@ -52,6 +53,10 @@ RING_SHARE = 0.05
 FURTHEST_RING_UM = 150.0
 #: Missing material that reaches no further than this behind the end of the light is the edge's own wear.
 BRINK_UM = 60.0
+#: Relative standard uncertainty of what is added to a depth for smoothing: damages are rounded, conical or stepped.
+U_FILLED_IN = 0.75
+#: Brightness of damage against the surface around it, logarithm: usually up to half or double.
+U_LOG_CONTRAST = 0.4
 #: Draws of noise with which the excess of a largest value over the true one is estimated.
 NOISE_DRAWS = 24
 #: Enclosed sound islands up to this many times the least damage area belong to the damage.
@@ -64,7 +69,8 @@ class DamageFinding:
 
     ``volume_mm3`` includes undefined pixels enclosed by the damage, interpolated; ``volume_lower_bound_mm3`` only
     what was measured; ``volume_interpolated_mm3`` also undefined pixels open to the edge. ``depth_um`` is the deepest
-    point of the residual smoothed with 15 um, ``d99_um`` the 99th percentile of the same inside the mask.
+    point: of the residual smoothed with 15 um, less what noise adds to a largest value, plus what smoothing filled in;
+    ``d99_um`` the 99th percentile of the smoothed residual inside the mask.
     ``mask_runs`` lists the mask as [row, first profile, length].
     """
 
@@ -136,31 +142,6 @@ class Detection:
     sigma_wide_um: float
 
 
-def uneven_noise(residual_um: Float32, smoothed_um: Float32, sound: Mask) -> Float32:
-    """Noise of each neighbourhood over the noise of the whole image, between 1 and 3.
-
-    Dark or oxidised stretches return a noisier line; one threshold for all would call them damaged. What is left after
-    smoothing is used, so a pit does not count as noise, and never less than 1: a quiet corner earns no extra alarms.
-    """
-    rough = np.where(sound, residual_um - smoothed_um, np.float32(np.nan))
-    overall = robust_sigma(rough[sound])
-    shape = residual_um.shape
-    size = tuple(max(8, min(32, length // 4)) for length in shape)
-    count = tuple(max(1, length // step) for length, step in zip(shape, size, strict=True))
-    if not overall > 0 or count[0] * count[1] < 9:
-        return np.ones(shape, dtype=np.float32)
-    inner = rough[: count[0] * size[0], : count[1] * size[1]]
-    blocks = np.abs(inner.reshape(count[0], size[0], count[1], size[1]).transpose(0, 2, 1, 3))
-    blocks = np.sort(blocks.reshape(count[0] * count[1], -1), axis=1)
-    measured = np.count_nonzero(np.isfinite(blocks), axis=1)
-    median = np.take_along_axis(blocks, np.maximum(measured - 1, 0)[:, None] // 2, axis=1)[:, 0]
-    ratio = np.where(measured >= 30, 1.4826 * median / overall, 1.0).reshape(count)
-    ratio = np.clip(ndimage.median_filter(ratio, size=3, mode="nearest"), 1.0, 3.0).astype(np.float32)
-    # A fifth above average is what 1000 correlated pixels scatter by chance.
-    ratio[ratio < 1.2] = 1.0
-    return np.asarray(cv2.resize(ratio, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR), dtype=np.float32)
-
-
 def detect(
     residual_um: Float32,
     valid: Mask,
@@ -168,11 +149,13 @@ def detect(
     profile_pitch_um: float,
     settings: InspectionSettings,
     *,
+    intensity: Float32 | None = None,
     sign: int = -1,
 ) -> Detection:
     """Find connected areas of missing (sign -1) or raised (sign +1) material in a residual image (rows, profiles).
 
-    ``valid`` marks the pixels that may be judged. Threshold: seed_k sigma_g to start, grow_k sigma_g to spread, with
+    ``valid`` marks the pixels that may be judged, ``intensity`` is the line's where it is
+    known. Threshold: seed_k sigma_g to start, grow_k sigma_g to spread, with
     sigma_g the robust standard deviation of the smoothed image itself, so correlated noise and leftover form raise it.
     """
     lost = (sign * residual_um).astype(np.float32)
@@ -192,7 +175,9 @@ def detect(
     sigmas = [0.0, 0.0, 0.0]
     found = np.zeros_like(valid)
     scales = (light, small, wide)
-    uneven = uneven_noise(lost, small.value, valid)
+    uneven = by_place(lost, small.value, valid)
+    if intensity is not None:
+        uneven = np.maximum(uneven, by_light(small.value, intensity, valid, row_pitch_um, profile_pitch_um))
     # The second pass measures the noise again without what the first pass found.
     for _ in range(2):
         field = [sound & (image.density > 0.6) for image in scales]
@@ -407,6 +392,7 @@ def findings(
         volume = lower + filled * pixel_area * 1e-9
         open_mm3 = extended * pixel_area * 1e-9
         u_volume = budget.volume_mm3(volume, int(np.count_nonzero(measured)), pixel_area, u_filled * pixel_area * 1e-9)
+        u_volume = math.hypot(u_volume, volume * rim_relative(float(np.count_nonzero(mask)) * pixel_area, settings))
 
         judged = mask & valid[crop] & (density >= LEAST_DENSITY)
         if not judged.any():
@@ -424,7 +410,12 @@ def findings(
             profile_pitch_um,
         )
         depth_um = max(depth_um - excess, 0.0)
-        u_depth = budget.depth_um(depth_um, math.hypot(sigma_here, 0.3 * excess))
+        wider = np.where(judged, detection.wide_image.value[crop], -np.inf)
+        filled_um, share = filled_in(depth_um, float(wider.max()), settings)
+        u_depth = budget.depth_um(
+            depth_um, math.hypot((1.0 + share) * sigma_here, 0.3 * excess, U_FILLED_IN * filled_um)
+        )
+        depth_um += filled_um
 
         rows_at, profiles_at = np.nonzero(whole)
         row_range = (int(rows_at.min()) + crop[0].start, int(rows_at.max()) + crop[0].start + 1)
@@ -575,6 +566,31 @@ def excess_of_largest(
         noise = noise[margin[0] : margin[0] + core.shape[0], margin[1] : margin[1] + core.shape[1]] * scale
         largest[draw] = float((core + noise)[inside].max())
     return max(0.0, float(largest.mean()) - top)
+
+
+def filled_in(depth_um: float, wider_um: float, settings: InspectionSettings) -> tuple[float, float]:
+    """How much of the depth smoothing and the laser line's own width have filled in, um, and the share it rests on.
+
+    On a rounded floor the loss grows with the square of the width of the kernel, so the heavier smoothing, which made
+    ``wider_um`` of the same damage, tells what the lighter one took. A narrow or one-sided damage follows no such law:
+    at most a quarter of the depth is added.
+    """
+    small, wide, blur = settings.small_scale_um**2, settings.wide_scale_um**2, settings.blur_um**2
+    if wide <= small:
+        return 0.0, 0.0
+    share = (small + blur) / (wide - small)
+    return float(np.clip(share * (depth_um - wider_um), 0.0, 0.25 * depth_um)), share
+
+
+def rim_relative(area_um2: float, settings: InspectionSettings) -> float:
+    """Relative standard uncertainty of a volume from its rim: where bright meets dark, the bright height counts more.
+
+    A height is the mean over the laser line's width, weighted by the light. For a paraboloid of area pi a^2 whose
+    brightness differs from its surroundings by u(ln C), blurred with standard deviation s: 8 s^2 u(ln C) / a^2.
+    """
+    if area_um2 <= 0:
+        return 0.0
+    return min(0.5, 8.0 * settings.blur_um**2 * U_LOG_CONTRAST * math.pi / area_um2)
 
 
 def _runs(mask: Mask, first_row: int, first_profile: int) -> tuple[tuple[int, int, int], ...]:

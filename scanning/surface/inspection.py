@@ -170,7 +170,7 @@ def _inspect(
             )
 
     def search(sign: int) -> Detection:
-        found = detect(residual, valid, row_pitch, profile_pitch, settings, sign=sign)
+        found = detect(residual, valid, row_pitch, profile_pitch, settings, intensity=image.intensity, sign=sign)
         return found if edge is None else without_brink(found, residual, valid, edge.side, row_pitch)
 
     missing, raised = search(-1), search(+1)

@@ -41,6 +41,7 @@ class InspectionSettings:
     ``u_scale_relative``, ``u_pitch_relative``: relative standard uncertainty of the height scale and of the pitches
     when known from elsewhere; None means not known, and every affected number says so.
     ``u_linearity_um``: what a straight calibration line leaves out inside its range (0.6 um on IS1).
+    ``blur_um``: standard deviation of a height's lateral blur; a line of 25 um full width at half maximum has 10.6.
     ``instrument_noise_um``: Sq of the instrument's own noise on the scale-limited surface, from a displaced repeat.
     ``visible_aspect``: gaps narrower than this times their depth cannot be seen by the camera (0.58 at 60 degrees) and
     are reflections; 0 for surfaces measured from straight above.
@@ -63,6 +64,7 @@ class InspectionSettings:
     u_scale_relative: float | None = None
     u_pitch_relative: float | None = None
     u_linearity_um: float = 0.6
+    blur_um: float = 10.6
     instrument_noise_um: float | None = None
     saturation_level: float | None = None
     visible_aspect: float = 0.5

@@ -78,7 +78,7 @@ def test_a_folder_becomes_a_scan_waiting_for_its_numbers(tool: Tool, rig: Rig, o
         folder, region=tool.regions.get(name="R2"), rig=rig, by=olga, original_name="knife.zip"
     )
 
-    assert (scan.state, scan.source, scan.recipe.name) == (ScanState.PROCESSING, "import", "HDRE-II")
+    assert (scan.state, scan.source, scan.recipe.name) == (ScanState.PROCESSING, "import", "PRECISE")
     assert scan.plan["steps"] == scan.total == 10
     assert scan.inspection.reason == "Imported knife.zip"
     with open_stack(settings.STACKS / scan.stack_file) as stored, open_stack(folder) as original:

@@ -45,7 +45,7 @@ def test_one_scan_per_active_region_with_everything_frozen(three: list[Scan], ri
         "step_um": pytest.approx(8.33), "exposures_us": [100.0, 300.0, 900.0], "rows": 64, "row_offset": 0,
         "columns": 256, "column_offset": 0, "flat_row": 4, "flat_rows": 40,
     }  # fmt: skip
-    assert three[0].recipe.name == "HDRE-II"
+    assert three[0].recipe.name == "PRECISE"
     assert three[0].total == 30
 
 

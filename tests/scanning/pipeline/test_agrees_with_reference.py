@@ -70,7 +70,10 @@ def anything(draw: st.DrawFn) -> tuple[Steps, tuple[float, ...], int, float, flo
     most = 10
     if before in [(sci,), (hdre, sci)] and sci.window % 2 and draw(st.booleans()):
         way = draw(st.sampled_from(["auto", "higher", "lower"]))
-        after = (Centroid(), Diagonals(px_per_step=draw(st.sampled_from([None, 0.7, 1.8])), direction=way))
+        share = draw(st.sampled_from([None, 0.5, 1.0]))
+        after = (
+            Centroid(), Diagonals(px_per_step=draw(st.sampled_from([None, 0.7, 1.8])), direction=way, share=share),
+        )  # fmt: skip
         most = 24
     recipe = Recipe("any", (*before, msnn, *after))
     steps = draw(st.integers(sci.window if recipe.compound else 1, most))

@@ -47,6 +47,7 @@ class Setting:
     jump: float = 10.0
     speed: float | None = None  # px per step of the surface on the sensor, for space-time analysis
     direction: int = 0
+    share: float | None = None  # of the way to the centre of gravity in time; None: with which rows agree best
     light_width: float = 3.0  # px, before GLT; 3 where nobody knows
 
 
@@ -484,16 +485,20 @@ def column_of(found: list[Line | None]) -> Array:
 
 
 def along_the_diagonals(
-    singles: list[Array], centre: int, steps: int, speed: float, found: list[Line | None], s: Setting
+    singles: list[Array], centre: int, steps: int, speed: float, found: list[Line | None], s: Setting, last: int
 ) -> Array:
-    """Centre of gravity in time of the light of surface points that move ``speed`` px per image."""
+    """Centre of gravity in time of the light of surface points that move ``speed`` px per image.
+
+    Images from 0 to ``last`` are there; a diagonal that would need others is cut on both sides alike.
+    """
     out = column_of(found)
     for r, line in enumerate(found):
         if line is None:
             continue
         light, when = [], []
         for j in range(-(s.window // 2), s.window // 2 + 1):
-            for k in range(-steps, steps + 1):
+            a = min(steps, centre + j, last - centre - j)
+            for k in range(-a, a + 1):
                 P = np.maximum(singles[centre + j + k][r], 0.0)  # noqa: N806
                 x = line.column + speed * k
                 if max(0, line.peak.first - 1) <= x <= min(P.size - 1, line.peak.last + 1):
@@ -502,6 +507,25 @@ def along_the_diagonals(
         if sum(light) > 0:
             out[r] += speed * np.average(when, weights=light)
     return out
+
+
+def share_of_the_way(seen: list[tuple[Array, Array]], s: Setting) -> float:
+    """The share of the way to the centre of gravity in time with which neighbouring rows agree best."""
+    if s.share is not None:
+        return s.share
+    x, y = [], []
+    for column, apart in seen:
+        a, b = np.diff(column), np.diff(apart)
+        use = np.isfinite(a) & np.isfinite(b)
+        for values in (a, b):
+            if use.any():
+                use = use & (np.abs(np.where(use, values, 0.0)) <= 4.0 * 1.4826 * np.median(np.abs(values[use])))
+        x += list(-a[use])
+        y += list(b[use])
+    if np.sum(np.square(y)) <= 0:
+        return 0.6
+    best = min(1.0, max(0.0, float(np.dot(x, y) / np.sum(np.square(y)))))
+    return (best * len(x) + 0.6 * 30) / (len(x) + 30)
 
 
 def above_threshold(image: Array, faint: float, s: Setting) -> list[list[Peak]]:
@@ -525,15 +549,25 @@ def range_columns(stack: list[list[NDArray[Any]]], s: Setting) -> Array:
         steps = min(12, math.ceil(2.2 * s.light_width / s.speed))
         need = s.window // 2 + steps
         way = s.direction
-        for n, span in enumerate(windows(len(stack), s)):
-            centre = span[len(span) // 2]
-            if not need <= centre < len(stack) - need:
-                continue
-            ways = {w: along_the_diagonals(singles, centre, steps, w * s.speed, found[n], s) for w in (-1, 1)}
+        seen: dict[int, list[tuple[Array, Array]]] = {}
+        centres = [span[len(span) // 2] for span in windows(len(stack), s)]
+        for n, centre in enumerate(centres):
+            # A profile comes out with the last image it needs, the first ones with that of the first whole diagonals.
+            last = min(max(centre, need) + need, len(stack) - 1)
             if way == 0:
-                rough = {w: np.abs(np.diff(c)) for w, c in ways.items()}
+                there = [m for m in range(n, len(centres)) if centres[m] + s.window // 2 <= last]
+                longest = max(there, key=lambda m: min(need, centres[m], last - centres[m]))
+                ways = {
+                    w: along_the_diagonals(singles, centres[longest], steps, w * s.speed, found[longest], s, last)
+                    for w in (-1, 1)
+                }
+                rough = {w: np.abs(np.diff(column)) for w, column in ways.items()}
                 if not np.isfinite(rough[1]).any():
                     continue
                 way = -1 if np.nanmedian(rough[-1]) <= np.nanmedian(rough[1]) else 1
-            columns[n] = ways[way]
+            last = len(stack) - 1
+            apart = along_the_diagonals(singles, centre, steps, way * s.speed, found[n], s, last) - columns[n]
+            reach = min(need, centre, last - centre)
+            seen.setdefault(reach, []).append((columns[n], apart))
+            columns[n] = columns[n] + share_of_the_way(seen[reach], s) * apart
     return np.stack(columns, axis=1)

@@ -23,6 +23,18 @@ def test_a_flat_floor_is_reported_at_its_depth():
     assert np.mean(inside) >= 0.85
 
 
+@pytest.mark.parametrize("size_um", [160.0, 250.0, 400.0])
+def test_what_smoothing_fills_in_of_a_rounded_pit_is_given_back(size_um: float) -> None:
+    errors, inside = [], []
+    for seed in range(6):
+        pit = Pit("cap", 1072.0, 1000.0, size_um, 40.0)
+        (found,) = inspect_surface(surface((300, 240), pits=(pit,), sigma_um=2.3, seed=seed)).damages
+        errors.append(found.depth_um - 40.0)
+        inside.append(abs(errors[-1]) < 2.0 * found.u_depth_um)
+    assert abs(np.mean(errors)) < 0.06 * 40.0
+    assert np.mean(inside) >= 0.8
+
+
 def test_the_noise_alone_has_no_depth():
     report = inspect_surface(surface((500, 241), (7.15, 41.65)))
     assert report.measurement("d_max").value == 0.0
