@@ -33,7 +33,7 @@ ANSWER_S = 2.0
 GREETING_S = 3.0
 #: How long to wait for the greeting after each reset that is sent, in seconds. A controller that is free greets in
 #: milliseconds; only one that did not heed the first reset gets a second.
-RESET_PATIENCE_S = (0.7, 0.7, GREETING_S)
+RESET_PATIENCE_S = (0.7, 0.7, 1.0, 1.0, 1.0, 1.0)
 #: How long the answer to a question asked in passing may take, in seconds. The firmware answers in milliseconds; a busy
 #: host or a slow adapter may take longer, and that is no fault of the line.
 ASKED_S = 0.5
