@@ -41,6 +41,7 @@ CHAMFER = 8
 """Places of rounded edges, dirt and short pieces that may lie between two treads, beside the guards."""
 SURE = 5.5
 """A wall stands out of the noise of the medians by so many standard deviations."""
+SAME_MM = 1e-6
 GUARD_ROWS = 8
 """On simulated gauges (f/5.6) the next tread draws a row 3 from the wall by 1.3 um, one 8 from it by 0.2 um."""
 DIAGONAL_STEPS = 7
@@ -235,16 +236,16 @@ def match_heights(gauge: Gauge, heights_mm: Sequence[float]) -> list[float]:
 
 
 def _rises(columns: Sequence[float], heights: Sequence[float]) -> bool:
+    """Whether columns rise wherever heights do; treads of one height (to a nanometre) may be in any order."""
     pairs = sorted(zip(heights, columns, strict=True))
-    highest_below = -math.inf
-    k = 0
-    while k < len(pairs):
-        same = [c for h, c in pairs if h == pairs[k][0]]
-        if min(same) <= highest_below:
-            return False
-        highest_below = max(same)
-        k += len(same)
-    return len({h for h, _ in pairs}) > 1
+    groups: list[list[float]] = []
+    last = -math.inf
+    for height, column in pairs:
+        if height - last > SAME_MM:
+            groups.append([])
+        groups[-1].append(column)
+        last = height
+    return len(groups) > 1 and all(max(low) < min(high) for low, high in pairwise(groups))
 
 
 def _um_per_px(header: object) -> float:
