@@ -57,6 +57,10 @@ LEAST_SPEED, MOST_SPEED = 0.18, 0.6
 WIDE_PX = 12.0
 VERY_WIDE_PX = 30.0
 """Wider lines than this come from lamp-lit pictures of others: what they must stand out of is structure, not noise."""
+FLAT_TOP_PX = 3
+"""So many saturated pixels in a row are a line with a flat top and no single hot pixel."""
+NOTED_SHARE = 0.1
+"""Overexposed or lost rows are worth a sentence from this share on."""
 INT32_TOP = (1 << 31) - 1
 Progress = Callable[[int, int], None]
 Float64 = NDArray[np.float64]
@@ -130,6 +134,9 @@ class ProfileStream:
         self._profiles = 0
         self._saturated = 0
         self._pixels = 0
+        self._rows_read = 0
+        self._rows_full = 0
+        self._rows_dark = 0
         self._chain: _Chain | None = None
         self._space_time: SpaceTime | None = None
         if not self._unknowns():
@@ -180,9 +187,13 @@ class ProfileStream:
     def _work(self, images: list[Image]) -> list[Profile]:
         assert self._chain is not None
         used = [images[e] for e in self._chain.selected]
-        for image in used:
-            self._saturated += int(np.count_nonzero(image >= self.header.saturation))
+        for number, image in enumerate(used):
+            full = image >= self.header.saturation
+            self._saturated += int(np.count_nonzero(full))
             self._pixels += image.size
+            if number == 0:  # of a bracket the shortest: what it overexposes no other exposure shows
+                self._rows_full += int(np.count_nonzero(np.count_nonzero(full, axis=1) >= FLAT_TOP_PX))
+                self._rows_read += image.shape[0]
         step = self._steps
         self._steps += 1
         lines = self._chain.run(used)
@@ -200,6 +211,7 @@ class ProfileStream:
                 confidence=lines[3],
             )
             self._profiles += 1
+            self._rows_dark += int(np.count_nonzero(np.isnan(lines[0])))
             self._saturated = self._pixels = 0
             out.append(profile)
         return out if self._space_time is None else self._later(self._space_time, out)
@@ -320,6 +332,7 @@ class ProfileStream:
             notes.append("The line's width is unknown and too few rows show a line; peaks of any width were taken.")
         if self.recipe.diagonals is not None and self._space_time is None:
             notes.append("The surface moves too far or too little per step for space-time analysis; it was left out.")
+        notes += self._bad_light()
         return {
             "recipe": self.recipe.to_json(),
             "recipe_sha256": self.recipe.sha256(),
@@ -345,6 +358,22 @@ class ProfileStream:
                 "numba": numba.__version__,
             },
         }
+
+    def _bad_light(self) -> list[str]:
+        """What the exposures did to the line, in a sentence a person can act on."""
+        notes: list[str] = []
+        full = self._rows_full / self._rows_read if self._rows_read else 0.0
+        if full >= NOTED_SHARE:
+            notes.append(f"The line is overexposed in {100 * full:.0f} % of the rows; add a shorter exposure.")
+        points = self._profiles * self.header.rows
+        dark = self._rows_dark / points if points else 0.0
+        if dark >= NOTED_SHARE:
+            notes.append(
+                f"No line was found in {100 * dark:.0f} % of the rows; where there is a surface, add a longer exposure."
+                if full < NOTED_SHARE
+                else f"No line was found in {100 * dark:.0f} % of the rows."
+            )
+        return notes
 
 
 class _Chain:
@@ -455,8 +484,18 @@ class _Chain:
         width_px = np.empty(self._rows)
         confidence = np.empty(self._rows)
         extract_line(
-            image, self._top, self._scale, self._dark, *self._linear, *self._line, highest, *self._scratch, column_px,
-            peak, width_px, confidence,
+            image,
+            self._top,
+            self._scale,
+            self._dark,
+            *self._linear,
+            *self._line,
+            highest,
+            *self._scratch,
+            column_px,
+            peak,
+            width_px,
+            confidence,
         )
         confidence[np.isnan(column_px)] = np.nan
         intensity = (peak / self._grey_level).astype(np.float32)

@@ -482,7 +482,7 @@ def nearest_on(peaks: list[Peak], row: int, earned: Earned, carrier: Carrier, s:
 
 
 def without_glow(rows: list[list[Peak]], chosen: list[int]) -> list[int]:
-    """From darkness inwards, rows are dropped that rows d further on (median of seven) outshine 4 d times, at d up to 2 2 d times."""
+    """From darkness inwards, rows are dropped that rows d further on (median of seven) outshine 4 d times; 2 d times at d < 3."""
     for order in (list(range(len(rows))), list(range(len(rows)))[::-1]):
         dark, nearest = 4, 8
         for n, r in enumerate(order):
@@ -491,7 +491,9 @@ def without_glow(rows: list[list[Peak]], chosen: list[int]) -> list[int]:
                 inner = [q for q in order[n + d : n + d + 7] if chosen[q] >= 0]
                 heights = sorted(rows[q][chosen[q]].height for q in inner)
                 if chosen[r] >= 0 and len(heights) > 3:
-                    glow |= (2 if d <= 2 else 4) * d * rows[r][chosen[r]].height < heights[len(heights) // 2] * (1 - TIE)
+                    glow |= (2 if d <= 2 else 4) * d * rows[r][chosen[r]].height < heights[len(heights) // 2] * (
+                        1 - TIE
+                    )
             if chosen[r] >= 0 and (dark < 4 or not glow):
                 dark = 0
             else:
