@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scanning.pipeline.stream import Profile, ProfileStream, process_stack
+from scanning.pipeline.stream import Profile, ProfileStream
+from scanning.pipeline.whole import process_stack
 from scanning.range_image import RangeImage
 from scanning.recipe import Recipe
 from tests.scanning.pipeline.agreement import assert_agree, header_for
