@@ -20,6 +20,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +53,8 @@ def _lines(rng: np.random.Generator, narrowest: float, widest: float, near: floa
     for _ in range(3):
         first = float(rng.uniform(0.03, 0.8))
         yield SecondLine(
-            first, min(1.0, first + float(rng.uniform(0.06, 0.25))), float(rng.choice([-1, 1]) * rng.uniform(near, far)),
+            first, min(1.0, first + float(rng.uniform(0.06, 0.25))),
+            float(rng.choice([-1, 1]) * rng.uniform(near, far)),
             float(rng.uniform(-0.06, 0.06)), float(rng.uniform(narrowest, widest)), float(rng.uniform(0.5, 4.0)),
             float(rng.uniform(-5.0, 5.0)),
         )  # fmt: skip
@@ -314,7 +316,7 @@ def print_tables(by: dict[tuple[str, str], Judged], names: tuple[str, ...]) -> N
     print(f"| reflections | recipe | {' | '.join(TITLES)} |\n|---|---|{'---|' * len(TITLES)}")
     for (kind, name), judged in sorted(by.items(), key=lambda entry: names.index(entry[0][1])):
         print(f"| {kind} | {name} | {' | '.join(judged.cells())} |")
-    spans = [f"{low:g}-{high:g}" for low, high in zip(CLASSES[:-1], CLASSES[1:], strict=True)]
+    spans = [f"{low:g}-{high:g}" for low, high in pairwise(CLASSES)]
     print(f"\nWrong or beyond, % of the points of a confidence\n\n| recipe | {' | '.join(spans)} |")
     print(f"|---|{'---|' * len(spans)}")
     for name in names:

@@ -33,6 +33,7 @@ class LiveRangeImage:
         self._height_um = np.full(shape, np.nan, np.float32)
         self._intensity = np.full(shape, np.nan, np.float32)
         self._width_px = np.full(shape, np.nan, np.float32)
+        self._confidence = np.full(shape, np.nan, np.float32)
         self._profiles = 0
         self._steps = 0
         self._saturated = 0
@@ -74,6 +75,7 @@ class LiveRangeImage:
             profile_pitch_um=self._recipe.profile_pitch_um(self._header.step_um),
             intensity=self._intensity[:, :count],
             width_px=self._width_px[:, :count],
+            confidence=self._confidence[:, :count],
             saturated=self._saturated,
             frame_pixels=self._pixels,
             wall_s=self._wall_s,
@@ -88,6 +90,7 @@ class LiveRangeImage:
             self._height_um[:, at] = heights_um(profile.column_px, self._header, self._calibration)
             self._intensity[:, at] = profile.intensity
             self._width_px[:, at] = profile.width_px
+            self._confidence[:, at] = profile.confidence
             self._saturated += profile.saturated
             self._pixels += profile.frame_pixels
             self._profiles = at + 1

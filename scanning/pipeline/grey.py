@@ -22,15 +22,18 @@ def grey(code, top, scale, dark):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def count_saturated(image, saturation):  # type: ignore[no-untyped-def]
-    """How many codes of a (rows, columns) image are at ``saturation`` or above."""
-    count = np.int64(0)
+def count_saturated(image, saturation, fewest):  # type: ignore[no-untyped-def]
+    """(codes at ``saturation`` or above in a (rows, columns) image, rows with at least ``fewest`` of them)."""
+    count, rows = np.int64(0), np.int64(0)
     for r in range(image.shape[0]):
         row = image[r]
         some = np.uint8(0)
         for c in range(row.size):
             some |= np.uint8(row[c] >= saturation)
         if some != 0:
+            before = count
             for c in range(row.size):
                 count += row[c] >= saturation
-    return count
+            if count - before >= fewest:
+                rows += 1
+    return count, rows

@@ -369,8 +369,8 @@ def compressed(value, linear, shift):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def extract_line(  # type: ignore[no-untyped-def]
-    image, top, scale, dark, linear, shift, by_noise, by_path, k, floor, from_row_mean, ceiling, snr, grain_px, expected,
-    factor, gate_px, gate_max_px, best_seed, light_width, jump, reach, box,
+    image, top, scale, dark, linear, shift, by_noise, by_path, k, floor, from_row_mean, ceiling, snr, grain_px,
+    expected, factor, gate_px, gate_max_px, best_seed, light_width, jump, reach, box,
     highest, light, of_three, noise, maxima, lit, of_row, of_rows, counts, chosen, of_path, column_px, peak, width_px,
     confidence,
 ):  # fmt: skip
@@ -378,7 +378,8 @@ def extract_line(  # type: ignore[no-untyped-def]
 
     Writes, per row, column_px (px from 0, NaN undefined), peak (light of the line's maximum), width_px (full width at
     half maximum, px) and confidence (0 to 1, see `path.trust`; NaN without a path), and returns the most candidates in
-    one row. If the scratch has no room for so many, nothing is written. What lies between ``box`` and ``column_px`` is scratch that keeps its size; see `chain.Scratch`.
+    one row. If the scratch has no room for so many, nothing is written. What lies between ``box`` and ``column_px`` is
+    scratch that keeps its size; see `chain.Scratch`.
     """
     rows = image.shape[0]
     faint = snr * noise_of(image, top, scale, linear, shift, noise) * STRICT if snr > 0.0 else 0.0

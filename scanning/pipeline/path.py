@@ -16,6 +16,16 @@ Further than gate_max_px (or than a tilted line would get over the gap) only a s
 the other one ends, within a few rows, however high the block is; a reflection has rows in common with the line. Where
 the line has ended, a reflection far away is no line.
 
+A reflection can be as wide as the line and brighter, over a few hundred rows; then only the surface tells: it is a
+straight line over most rows, and a reflection is not on it. So the best path is found twice. In between, the straight
+line that most rows have a candidate on (the carrier) is looked for. Where fewer than 40 % of the rows agree on one, a
+staircase or a curved part, the first path stands; from 70 % on the carrier has its full say: a candidate on it earns
+half as much again, one off it half as much, and one on it that a reflection touches and widens is taken too, if it is
+bright. The width is then that of the carrier's own candidates: a lens widens the line, and a line narrower than what
+the lens makes of it is a reflection.
+
+Where the line ends, the lens lights rows in which there is no surface; see `leave_glow_out`.
+
 A path is forgotten as soon as a path of a later row within gate_max_px is so much better that coming over from that one
 to where it stands costs less than it is behind: the cost is concave in d, so it could not win again. A handful of paths
 stay alive.
@@ -43,10 +53,14 @@ IN_COMMON = 2
 """Rows the two sides of a step may both be seen in: the lens blurs its brink."""
 LINES_TRIED = 48
 ROWS_LOOKED_AT = 64
+"""Of all rows, for counting who agrees with a straight line that is tried."""
 FEWEST_ROWS = 16
 LEAST_SHARE, FULL_SHARE = 0.4, 0.7
+"""Rows that must agree on the carrier: below none of it counts, above all."""
 TOUCHED = 0.3
+"""Least likeness of a bright candidate on the carrier, however wide a reflection makes it."""
 DARK_ROWS = 4
+"""So many rows without a line end it."""
 ROWS_INSIDE = 7
 GLOW_ROWS = 32
 BORDER_ROWS = 8
@@ -55,7 +69,9 @@ MOST_BLURRED = 1.6
 UNSEEN, OFF_THE_CARRIER = 0.9, 0.5
 AROUND, SEEN_AROUND = 8, 0.65
 ASIDE = 0.5
+"""Share of the reward a candidate off the carrier loses."""
 BONUS = 0.5
+"""Reward for being on the carrier."""
 BY_LIGHT = 0.1
 """This share of the reward depends on the light: of two equal paths the brighter one is the line."""
 BRIGHT = 0.25
@@ -276,9 +292,7 @@ def find_path(  # type: ignore[no-untyped-def]
         judge(counts, shape, height, average, widened, expected, factor, bright, width, carrier, agreeing, earned)
         best_path(counts, shape, earned, width, jump, gate, track, score, back_row, back_peak, alive, chosen)
     leave_glow_out(height, chosen)
-    trust(
-        counts, shape, average, widened, expected, factor, width, carrier, agreeing, earned, chosen, confidence
-    )
+    trust(counts, shape, average, widened, expected, factor, width, carrier, agreeing, earned, chosen, confidence)
 
 
 @nb.njit(cache=True, nogil=True)

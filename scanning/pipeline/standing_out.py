@@ -13,8 +13,8 @@ candidates in 60 % of the rows beside a reflection). Noise is the same in every 
 4. The base, over which the centre of gravity is taken, reaches on both sides to where the smoothed light falls to
    ``floor`` of the candidate's own height or into the noise, to the valley before the next candidate, and no further
    than ``reach`` columns. The share counts from the row's mean, so that a lamp does not stretch the base; light above
-   the candidate's own is left out of that mean, or a bright reflection would lift it over a dim line. It is found in the smoothed
-   light, so no single grain decides where it ends.
+   the candidate's own is left out of that mean, or a bright reflection would lift it over a dim line. It is found
+   in the smoothed light, so no single grain decides where it ends.
 
 Width is the full width at half maximum of the smoothed light, less what the smoothing added.
 """

@@ -28,6 +28,10 @@ FIRST_STEPS = 5
 """Stage positions looked at before the first profile when something must be estimated."""
 LEAST_SPEED, MOST_SPEED = 0.18, 0.6
 """Space-time analysis needs a surface that moves by these shares of the line's width per step, or between."""
+FLAT_TOP_PX = 3
+"""So many saturated pixels in a row are a line with a flat top and no single hot pixel."""
+NOTED_SHARE = 0.1
+"""Overexposed or lost rows are worth a sentence from this share on."""
 Float64 = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
@@ -81,6 +85,9 @@ class ProfileStream:
         self._profiles = 0
         self._saturated = 0
         self._pixels = 0
+        self._rows_read = 0
+        self._rows_full = 0
+        self._rows_dark = 0
         self._chain: Chain | None = None
         self._space_time: SpaceTime | None = None
         if not has_unknowns(recipe, header):
@@ -131,9 +138,13 @@ class ProfileStream:
     def _work(self, images: list[Image]) -> list[Profile]:
         assert self._chain is not None
         used = [images[e] for e in self._chain.selected]
-        for image in used:
-            self._saturated += int(count_saturated(image, self.header.saturation))
+        for number, image in enumerate(used):
+            saturated, rows_full = count_saturated(image, self.header.saturation, FLAT_TOP_PX)
+            self._saturated += saturated
             self._pixels += image.size
+            if number == 0:  # of a bracket the shortest: what it overexposes no other exposure shows
+                self._rows_full += rows_full
+                self._rows_read += image.shape[0]
         step = self._steps
         self._steps += 1
         lines = self._chain.run(used)
@@ -151,6 +162,7 @@ class ProfileStream:
                 confidence=lines[3],
             )
             self._profiles += 1
+            self._rows_dark += int(np.count_nonzero(np.isnan(lines[0])))
             self._saturated = self._pixels = 0
             out.append(profile)
         return out if self._space_time is None else self._later(self._space_time, out)
@@ -201,6 +213,7 @@ class ProfileStream:
             notes.append("The line's width is unknown and too few rows show a line; peaks of any width were taken.")
         if self.recipe.diagonals is not None and self._space_time is None:
             notes.append("The surface moves too far or too little per step for space-time analysis; it was left out.")
+        notes += self._bad_light()
         return {
             "recipe": self.recipe.to_json(),
             "recipe_sha256": self.recipe.sha256(),
@@ -226,6 +239,22 @@ class ProfileStream:
                 "numba": numba.__version__,
             },
         }
+
+    def _bad_light(self) -> list[str]:
+        """What the exposures did to the line, in a sentence a person can act on."""
+        notes: list[str] = []
+        full = self._rows_full / self._rows_read if self._rows_read else 0.0
+        if full >= NOTED_SHARE:
+            notes.append(f"The line is overexposed in {100 * full:.0f} % of the rows; add a shorter exposure.")
+        points = self._profiles * self.header.rows
+        dark = self._rows_dark / points if points else 0.0
+        if dark >= NOTED_SHARE:
+            notes.append(
+                f"No line was found in {100 * dark:.0f} % of the rows; where there is a surface, add a longer exposure."
+                if full < NOTED_SHARE
+                else f"No line was found in {100 * dark:.0f} % of the rows."
+            )
+        return notes
 
 
 def _native(image: Image) -> Image:
