@@ -381,8 +381,9 @@ def extract_line(  # type: ignore[no-untyped-def]
     """MSNN then COG on one (rows, columns) image of integer codes (see `grey.grey` for top, scale, dark).
 
     Writes, per row, column_px (px from 0, NaN undefined), peak (light of the line's maximum), width_px (full width at
-    half maximum, px) and confidence (0 to 1, see `path.trust`; NaN without a path). What lies
-    between ``box`` and ``column_px`` is scratch that keeps its size. ``linear`` and ``shift`` undo GLT (`tone.light_table`; empty where there is none).
+    half maximum, px) and confidence (0 to 1, see `path.trust`; NaN without a path). What lies between ``box`` and
+    ``column_px`` is scratch that keeps its size. ``linear`` and ``shift`` undo GLT (`tone.light_table`; empty where
+    there is none).
     """
     rows = image.shape[0]
     faint = snr * noise_of(image, top, scale, linear, shift) * STRICT if snr > 0.0 else 0.0
