@@ -379,7 +379,8 @@ def extract_line(  # type: ignore[no-untyped-def]
     Writes, per row, column_px (px from 0, NaN undefined), peak (light of the line's maximum), width_px (full width at
     half maximum, px) and confidence (0 to 1, see `path.trust`; NaN without a path), and returns the most candidates in
     one row. If the scratch has no room for so many, nothing is written. What lies between ``box`` and ``column_px`` is
-    scratch that keeps its size; see `chain.Scratch`.
+    scratch that keeps its size; see `chain.Scratch`. ``linear`` and ``shift`` undo GLT (`tone.light_table`; empty where
+    there is none).
     """
     rows = image.shape[0]
     faint = snr * noise_of(image, top, scale, linear, shift, noise) * STRICT if snr > 0.0 else 0.0

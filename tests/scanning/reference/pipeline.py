@@ -480,7 +480,7 @@ def nearest_on(peaks: list[Peak], row: int, earned: Earned, carrier: Carrier, s:
 
 
 def without_glow(rows: list[list[Peak]], chosen: list[int]) -> list[int]:
-    """From darkness inwards, rows are dropped that rows d further on (median of seven) outshine 4 d times; 2 d times at d < 3."""
+    """From darkness inwards, rows go that a median of seven d rows further on outshines 4 d times (2 d for d < 3)."""
     for order in (list(range(len(rows))), list(range(len(rows)))[::-1]):
         dark, nearest = 4, 8
         for n, r in enumerate(order):
