@@ -92,7 +92,7 @@ def test_every_height_outside_the_gauge_is_flagged_in_the_image_and_its_file(tmp
     again = RangeImage.load(tmp_path / "range.npz").outside_calibrated
     assert again is not None
     assert again.tolist() == expected
-    assert precision_of(image).to_json()["outside_calibrated"] == {"count": 2}
+    assert precision_of(image).to_json()["outside_calibrated"] == {"count": 2, "share": 0.4}
 
 
 def test_heights_without_a_gauge_have_no_range(tmp_path: Path) -> None:
