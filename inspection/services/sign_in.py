@@ -36,8 +36,8 @@ def wait_after(count: int, free: int) -> dt.timedelta:
     """How long the next try must wait after ``count`` wrong ones."""
     if count < free:
         return dt.timedelta(0)
-    doubled: int = 2 ** min(count - free, 10)
-    return min(FIRST_WAIT * doubled, LONGEST_WAIT)
+    doubled: dt.timedelta = FIRST_WAIT * 2 ** min(count - free, 10)
+    return min(doubled, LONGEST_WAIT)
 
 
 def begin_attempt(name: str, address: str, *, now: dt.datetime | None = None) -> None:
