@@ -37,7 +37,8 @@ def bare(image: RangeImage) -> RangeImage:
         np.savez(place, **{name: stored[name] for name in stored.files if name != "confidence"})
     return RangeImage.objects.create(
         scan=image.scan, recipe=image.recipe, created_at=image.created_at + dt.timedelta(minutes=1),
-        file=f"pages/{place.name}", sha256="older", rows=SHAPE[0], profiles=SHAPE[1], row_pitch_um=ROW_UM, profile_pitch_um=PROFILE_UM, provenance={},
+        file=f"pages/{place.name}", sha256="older", rows=SHAPE[0], profiles=SHAPE[1],
+        row_pitch_um=ROW_UM, profile_pitch_um=PROFILE_UM, provenance={},
     )  # fmt: skip
 
 
