@@ -278,6 +278,7 @@ ACQUISITION = {
         "paused_s": 0.0,
         "parking_s": 1.2,
         "software_s": 3.7,
+        "overlapped_s": 18.4,
     },
     "software_share": 0.0245,
     "link": {"lines_sent": 1489, "bad_lines": 0, "retries": 0, "resets": 0},

@@ -67,6 +67,12 @@ def test_the_page_offers_the_map_and_says_both_figures(browse: Browse, image: Ra
     assert 'Outside the calibrated range</dt><dd>0.0 % <span class="unit">of heights' in page
 
 
+def test_read_out_on_the_way_is_told_beside_the_budget_and_not_in_it(browse: Browse, image: RangeImage) -> None:
+    page = page_of(browse("vera"), image)
+    assert "While the stage moved the camera was read out for 18.4 s" in page
+    assert "overlapped" not in page
+
+
 def test_the_map_is_the_stored_confidence_on_a_scale_from_nothing_to_one(browse: Browse, image: RangeImage) -> None:
     answer = fetch(browse("vera"), image.scan, channel="confidence")
     assert (answer["X-Span"], answer["X-Unit"]) == ("0,1", "1")

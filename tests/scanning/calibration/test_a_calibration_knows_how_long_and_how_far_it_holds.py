@@ -32,7 +32,7 @@ def test_the_covariance_gives_the_uncertainty_of_any_height() -> None:
         ("2026-11-24", "valid", "valid until 2027-05-24"),
         ("2027-04-24", "due", "in 30 days"),
         ("2027-05-24", "due", "in 0 days"),
-        ("2027-05-25", "expired", "expired on 2027-05-24, 1 days ago"),
+        ("2027-05-25", "expired", "expired on 2027-05-24, 1 day ago"),
     ],
 )
 def test_expiry_is_told_by_the_day(on: str, state: str, said: str) -> None:
