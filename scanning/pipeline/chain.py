@@ -13,6 +13,7 @@ from scanning.pipeline.compound import CompoundWindow
 from scanning.pipeline.exposure import exposure_grey, fuse_codes, fuse_sums, look_up
 from scanning.pipeline.grey import DARK_UNIT
 from scanning.pipeline.line import extract_line
+from scanning.pipeline.path import TOUCHED
 from scanning.pipeline.settle import GRAIN_PX, Settled
 from scanning.pipeline.smoothing import ROWS_LOOKED_AT, WORD, Rows, box_for, kind_for
 from scanning.pipeline.tone import GREY_TOP, fixed_point, grey_bits, light_table, scaled_codes, tone
@@ -140,11 +141,14 @@ class Chain:
         width = settled.expected_width_px
         unit = line.width_px or settled.line_width_px or GRAIN_PX
         box = box_for(width)
+        # A logarithmic camera shows a reflection hardly brighter than the line: bright says nothing there.
+        touched = TOUCHED if header.response == "linear" else 0.0
         self._line = (
             settled.candidates == "noise", settled.continuity == "path", settled.k, settled.floor,
             line.floor_from == "row_mean", line.ceiling, settled.snr, settled.grain_px,
             1.0 if width is None else width, np.inf if width is None else line.width_factor,
-            line.gate_px, line.gate_max_px, line.seed == "best", unit, line.jump, math.ceil(REACH * unit), box,
+            line.gate_px, line.gate_max_px, line.seed == "best", unit, touched, line.jump,
+            math.ceil(REACH * unit), box,
         )  # fmt: skip
         # The light before GLT, which candidates are looked for in.
         self._linear: tuple[NDArray[np.uint32], int] = np.zeros(0, np.uint32), 0

@@ -370,7 +370,7 @@ def compressed(value, linear, shift):  # type: ignore[no-untyped-def]
 @nb.njit(cache=True, nogil=True)
 def extract_line(  # type: ignore[no-untyped-def]
     image, top, scale, dark, linear, shift, by_noise, by_path, k, floor, from_row_mean, ceiling, snr, grain_px,
-    expected, factor, gate_px, gate_max_px, best_seed, light_width, jump, reach, box,
+    expected, factor, gate_px, gate_max_px, best_seed, light_width, touched, jump, reach, box,
     highest, light, of_three, noise, maxima, lit, of_row, of_rows, counts, chosen, of_path, column_px, peak, width_px,
     confidence,
 ):  # fmt: skip
@@ -401,8 +401,8 @@ def extract_line(  # type: ignore[no-untyped-def]
         widened = BOX_WIDENS * (box * box - 1) if by_noise else 0.0
         average, track, score, back_row, back_peak, alive = of_path
         find_path(
-            counts, shape, half, height, widened, expected, factor, light_width, jump, gate_max_px, average, track,
-            score, back_row, back_peak, alive, chosen, confidence,
+            counts, shape, half, height, widened, expected, factor, light_width, touched, jump, gate_max_px, average,
+            track, score, back_row, back_peak, alive, chosen, confidence,
         )  # fmt: skip
     else:
         find_line(counts, shape, height, expected, factor, gate_px, gate_max_px, best_seed, chosen)

@@ -161,7 +161,7 @@ def cost(moved, rows_on, is_step, width, jump, gate):  # type: ignore[no-untyped
 
 @nb.njit(cache=True, nogil=True)
 def judge(  # type: ignore[no-untyped-def]
-    counts, shape, height, average, widened, expected, factor, bright, width, carrier, agreeing, earned
+    counts, shape, height, average, widened, expected, factor, bright, width, touched, carrier, agreeing, earned
 ):
     """Write what every candidate earns when it is taken, 0 for one that never is."""
     judged = np.isfinite(factor)
@@ -175,7 +175,7 @@ def judge(  # type: ignore[no-untyped-def]
                 off = abs(shape[r, k, 0] - carrier[0] - carrier[1] * r) / width
                 near = max(0.0, min(1.0, 2.0 - off))
                 if height[r, k] >= bright:
-                    alike = max(alike, TOUCHED * near)
+                    alike = max(alike, touched * near)
                 alike *= 1.0 - agreeing * ASIDE * (1.0 - near)
             if alike > TIE:
                 alike *= 1.0 - BY_LIGHT + BY_LIGHT * min(1.0, height[r, k] / bright)
@@ -268,19 +268,20 @@ def width_on(counts, shape, earned, average, carrier, width, widened, expected):
 
 @nb.njit(cache=True, nogil=True)
 def find_path(  # type: ignore[no-untyped-def]
-    counts, shape, half, height, widened, expected, factor, width, jump, gate, average, track, score, back_row,
-    back_peak, alive, chosen, confidence,
+    counts, shape, half, height, widened, expected, factor, width, touched, jump, gate, average, track, score,
+    back_row, back_peak, alive, chosen, confidence,
 ):  # fmt: skip
     """Choose the candidate of every row that is on the best path, -1 where there is none; see `trust` for confidence.
 
     ``expected`` width (px) as the image shows it and the factor it may be off (inf: any); ``width`` of the light, the
-    unit of moving. ``average, track, score, back_row, back_peak, alive`` are scratch.
+    unit of moving; ``touched`` is TOUCHED, or 0 for a camera whose grey values do not tell bright from dim.
+    ``average, track, score, back_row, back_peak, alive`` are scratch.
     """
     average_halves(counts, shape, half, width, average, track)
     bright = BRIGHT * mean_of_highest(counts, height)
     carrier = np.zeros(2)
     earned = np.zeros_like(score)
-    judge(counts, shape, height, average, widened, expected, factor, bright, width, carrier, 0.0, earned)
+    judge(counts, shape, height, average, widened, expected, factor, bright, width, touched, carrier, 0.0, earned)
     best_path(counts, shape, earned, width, jump, gate, track, score, back_row, back_peak, alive, chosen)
     share = find_carrier(counts, shape, earned, chosen, width, carrier)
     agreeing = 0.0
@@ -289,7 +290,9 @@ def find_path(  # type: ignore[no-untyped-def]
             blurred = width_on(counts, shape, earned, average, carrier, width, widened, expected)
             expected = min(MOST_BLURRED * expected, max(expected, blurred))
         agreeing = min(1.0, (share - LEAST_SHARE) / (FULL_SHARE - LEAST_SHARE))
-        judge(counts, shape, height, average, widened, expected, factor, bright, width, carrier, agreeing, earned)
+        judge(
+            counts, shape, height, average, widened, expected, factor, bright, width, touched, carrier, agreeing, earned
+        )
         best_path(counts, shape, earned, width, jump, gate, track, score, back_row, back_peak, alive, chosen)
     leave_glow_out(height, chosen)
     trust(counts, shape, average, widened, expected, factor, width, carrier, agreeing, earned, chosen, confidence)

@@ -39,6 +39,8 @@ from scanning.pipeline.grey import grey
 
 MOST_STEPS = 12
 """Images looked at on each side of a point's own; with smaller steps than this reaches, the gain is not worth it."""
+TIE_PX = 1e-9
+"""Rounding must not decide which way the surface moves."""
 USUAL_SHARE = 0.6
 USUAL_ROWS = 30
 """What the share is before any row was seen, and how many rows it takes to outweigh that."""
@@ -217,7 +219,7 @@ class SpaceTime:
         rough = {way: roughness(self._followed(one, way)) for way in (-1, 1)}
         if math.isnan(rough[1]):
             return 0
-        return -1 if rough[-1] <= rough[1] else 1
+        return -1 if rough[-1] <= rough[1] + TIE_PX else 1
 
     def _corrected(self, one: Waiting) -> Float64:
         if self.direction == 0:

@@ -30,6 +30,8 @@ SHALLOW = 0.8
 """A valley above this share of the lower of its two maxima does not part them."""
 NOISE_AT_THE_FOOT = 1.5
 """The base ends this many spreads above the level off the line, however faint the line."""
+ABOVE = 1.0 + 1e-12
+"""Light is above where a base ends when it is above it by more than rounding."""
 BOX_WIDENS = 2.0 * np.log(2.0) * 4.0 / 6.0
 """Two boxes of b columns add this times (b^2 - 1) to the square of a Gaussian's full width at half maximum."""
 
@@ -94,7 +96,7 @@ def row_candidates(  # type: ignore[no-untyped-def]
         if from_row_mean:
             total = total_of(smooth) if k == brightest else sum_up_to(smooth, smooth[m])
             background = max(background, total / columns)
-        ends = max(foot, background + floor * (smooth[m] - background))
+        ends = max(foot, background + floor * (smooth[m] - background)) * ABOVE
         middle_level = level + 0.5 * tall
         lowest, highest = max(0, m - reach), min(columns - 1, m + reach)
         if k > 0:

@@ -91,6 +91,7 @@ def reference(steps: Steps, header: StackHeader, recipe: Recipe) -> NDArray[np.f
         candidates=candidates,
         continuity=line.continuity if line.continuity != "auto" else ("nearest" if light_width > 30 else "path"),
         jump=line.jump,
+        touched=0.3 if header.response == "linear" else 0.0,
         speed=speed_of(recipe, header, light_width),
         share=recipe.diagonals.share if recipe.diagonals else None,
         direction={"auto": 0, "higher": 1, "lower": -1}[recipe.diagonals.direction] if recipe.diagonals else 0,

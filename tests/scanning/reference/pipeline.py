@@ -45,6 +45,7 @@ class Setting:
     candidates: str = "noise"
     continuity: str = "path"
     jump: float = 10.0
+    touched: float = 0.3  # least likeness of a bright candidate on the carrier
     speed: float | None = None  # px per step of the surface on the sensor, for space-time analysis
     direction: int = 0
     share: float | None = None  # of the way to the centre of gravity in time; None: with which rows agree best
@@ -298,7 +299,8 @@ def smoothed(image: Array, box: int) -> Array:
 def standing_out(image: Array, faint: float, s: Setting) -> list[list[Peak]]:
     box = 3 if s.width is None else min(15, max(3, 2 * math.floor(s.width / 2) + 1))
     added = 8 * math.log(2) * (box**2 - 1) / 6
-    soft = smoothed(image, box)
+    # Sums of fractions differ in their last digit where the light is equal; equal light is no slope.
+    soft = np.round(smoothed(image, box), 9)
     seen = soft[looked_at(len(soft))]
     level = upper_median(seen)
     apart = 2 * box % seen.shape[1]
@@ -324,7 +326,7 @@ def standing_out(image: Array, faint: float, s: Setting) -> list[list[Peak]]:
         for n, top in enumerate(tops):
             tall = S[top] - level
             dim = max(level, np.minimum(S, S[top]).mean()) if s.floor_from_row_mean else level
-            ends = max(level + 1.5 * spread, dim + s.floor * (S[top] - dim))
+            ends = max(level + 1.5 * spread, dim + s.floor * (S[top] - dim)) * (1 + 1e-12)
             first = last = top
             lowest, highest = top - reach, top + reach
             if n > 0:
@@ -425,7 +427,7 @@ def judged(
             if agreeing > 0:
                 near = max(0.0, min(1.0, 2 - off_carrier(peak, r, carrier) / s.light_width))
                 if peak.height >= bright:
-                    alike = max(alike, 0.3 * near)
+                    alike = max(alike, s.touched * near)
                 alike *= 1 - agreeing * 0.5 * (1 - near)
             if alike > TIE:
                 earned[r, k] = alike * (0.9 + 0.1 * min(1.0, peak.height / bright)) + 0.5 * agreeing * near
@@ -717,7 +719,7 @@ def range_columns(stack: list[list[NDArray[Any]]], s: Setting) -> Array:
                 rough = {w: np.abs(np.diff(column)) for w, column in ways.items()}
                 if not np.isfinite(rough[1]).any():
                     continue
-                way = -1 if np.nanmedian(rough[-1]) <= np.nanmedian(rough[1]) else 1
+                way = -1 if np.nanmedian(rough[-1]) <= np.nanmedian(rough[1]) + 1e-9 else 1
             last = len(stack) - 1
             apart = along_the_diagonals(singles, centre, steps, way * s.speed, found[n], s, last) - columns[n]
             reach = min(need, centre, last - centre)
