@@ -147,12 +147,7 @@ class Calibration:
         """Whether the calibration holds on a day, and the sentence that says so. The last day still counts."""
         if self.expires_on is None:
             return "without expiry", "The calibration has no expiry date; calibrate with one."
-        left = (dt.date.fromisoformat(self.expires_on) - on).days
-        if left < 0:
-            return "expired", f"The calibration expired on {self.expires_on}, {-left} days ago; calibrate again."
-        if left <= DUE_DAYS:
-            return "due", f"The calibration expires on {self.expires_on}, in {left} days."
-        return "valid", f"The calibration is valid until {self.expires_on}."
+        return standing(dt.date.fromisoformat(self.expires_on), on)
 
     @property
     def u_slope_relative(self) -> float:
@@ -370,6 +365,17 @@ def _number(written: str, decimal_comma: bool, what: str) -> float:
     if not math.isfinite(value):
         raise BadInput(f'{what} is "{written}", not a finite number; measure this step again or delete the line')
     return value
+
+
+def standing(expires_on: dt.date, on: dt.date) -> tuple[State, str]:
+    """Whether a calibration that expires on one day holds on another, and the sentence. The last day still counts."""
+    left = (expires_on - on).days
+    days = f"{abs(left)} day" if abs(left) == 1 else f"{abs(left)} days"
+    if left < 0:
+        return "expired", f"The calibration expired on {expires_on}, {days} ago; calibrate again."
+    if left <= DUE_DAYS:
+        return "due", f"The calibration expires on {expires_on}, in {days}."
+    return "valid", f"The calibration is valid until {expires_on}."
 
 
 def read_calibration(path: Path) -> Calibration:

@@ -29,6 +29,8 @@ _FLAT = 1.3
 _DEFINED = 0.8
 _WILD = 6.0
 _MAD = 1.4826
+#: A point this sure is on the laser line: of those above it fewer than 1 in 1000 are not.
+CONFIDENT = 0.95
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,9 @@ class PrecisionReport:
     there more than 6 robust sigmas off the plane. ``lateral_cell_um``: [along the scan, along the rows], what one value
     is averaged over. ``correlation_scan``, ``correlation_rows``: of the errors at lags 1, 2, 3.
     ``ns_per_range_pixel``: wall time; ``cpu_ns_per_range_pixel``: processor time. ``outside_calibrated``: heights
-    beyond the gauge's range; None when they do not come from a gauge.
+    beyond the gauge's range and ``outside_calibrated_share`` their share of the heights; None when they do not come
+    from a gauge. ``confident_share``: measured points with a confidence above `CONFIDENT`; None when nothing said how
+    sure the points are.
     """
 
     undefined: int
@@ -72,13 +76,18 @@ class PrecisionReport:
     ns_per_range_pixel: float | None
     cpu_ns_per_range_pixel: float | None
     outside_calibrated: int | None = None
+    outside_calibrated_share: float | None = None
+    confident_share: float | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Plain JSON values with the keys of contract 3."""
         return {
             "undefined": {"count": self.undefined, "share": self.undefined_share},
             "saturated": {"count": self.saturated, "share": self.saturated_share},
-            "outside_calibrated": None if self.outside_calibrated is None else {"count": self.outside_calibrated},
+            "outside_calibrated": None
+            if self.outside_calibrated is None
+            else {"count": self.outside_calibrated, "share": self.outside_calibrated_share},
+            "confident": None if self.confident_share is None else {"above": CONFIDENT, "share": self.confident_share},
             "sigma_um": self.sigma_um,
             "sigma_robust_um": self.sigma_robust_um,
             "wild_pixels_in_flat_region": self.wild,
@@ -118,7 +127,9 @@ def precision_of(image: RangeImage, flat: FlatRegion | None = None) -> Precision
             scan = tuple(_correlation(tame[:, :-lag], tame[:, lag:]) for lag in (1, 2, 3))
             rows = tuple(_correlation(tame[:-lag], tame[lag:]) for lag in (1, 2, 3))
     size = image.height_um.size
+    measured = size - image.undefined
     outside = image.outside_calibrated
+    beyond = None if outside is None else int(np.count_nonzero(outside))
     return PrecisionReport(
         undefined=image.undefined,
         undefined_share=image.undefined_share,
@@ -133,8 +144,20 @@ def precision_of(image: RangeImage, flat: FlatRegion | None = None) -> Precision
         correlation_rows=rows,
         ns_per_range_pixel=1e9 * image.wall_s / size if size and image.wall_s > 0 else None,
         cpu_ns_per_range_pixel=1e9 * image.cpu_s / size if size and image.cpu_s > 0 else None,
-        outside_calibrated=None if outside is None else int(np.count_nonzero(outside)),
+        outside_calibrated=beyond,
+        outside_calibrated_share=beyond / measured if beyond is not None and measured else None,
+        confident_share=_confident_share(image),
     )
+
+
+def _confident_share(image: RangeImage) -> float | None:
+    """Share of the measured points above `CONFIDENT`; None when none of them says how sure it is."""
+    if image.confidence is None:
+        return None
+    told = image.confidence[np.isfinite(image.height_um)]
+    if not np.isfinite(told).any():
+        return None
+    return float(np.count_nonzero(told > CONFIDENT) / told.size)
 
 
 def lateral_cell_um(image: RangeImage) -> tuple[float, float]:

@@ -29,7 +29,7 @@ class RangeImage:
     Arrays are (rows, profiles): rows along the laser line, profiles along the scan. NaN means not measured.
     ``height_um`` is positive out of the material. ``intensity`` is the grey value of the line's peak as the centroid
     saw it, ``width_px`` its full width at half maximum. ``confidence``, 0 to 1, says how sure it is that a point is on
-    the laser line and not on a reflection (above 0.9 fewer than 1 in 1000 are not); None where nothing said so.
+    the laser line and not on a reflection (above 0.95 fewer than 1 in 1000 are not); None where nothing said so.
     ``row_pitch_um`` lies along the rows, ``profile_pitch_um`` along the scan (41.65 for block SCI, 8.33 sliding).
     ``saturated`` counts saturated pixels in the frames used, ``frame_pixels`` all pixels looked at.
     ``provenance`` is JSON-serialisable: recipe in full, header, calibration, software versions, estimated values.

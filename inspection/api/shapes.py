@@ -135,8 +135,15 @@ class Precision(Schema):
     sigma_um: float | None
     cell_row_um: float
     cell_scan_um: float
-    ns_per_range_pixel: float
+    ns_per_range_pixel: float | None = Field(description="null: not computed from frames.")
     cpu_ns_per_range_pixel: float | None
+    confident_share: float | None = Field(
+        description="Share of the measured points whose confidence is above confident_above; null: not told."
+    )
+    confident_above: float | None
+    outside_calibrated_share: float | None = Field(
+        description="Share of the heights beyond the range of the gauge; null: no gauge."
+    )
 
 
 class CalibrationUsed(Schema):

@@ -110,6 +110,26 @@ class PrecisionReport(InsertOnly):
     def __str__(self) -> str:
         return f"precision of range image {self.range_image_id}"
 
+    @property
+    def confident_share(self) -> float | None:
+        """Share of the measured points whose confidence is above ``confident_above``; None where it was not told."""
+        return self._told("confident", "share")
+
+    @property
+    def confident_above(self) -> float | None:
+        return self._told("confident", "above")
+
+    @property
+    def outside_calibrated_share(self) -> float | None:
+        """Share of the heights that are extrapolated beyond the gauge; None without a gauge."""
+        return self._told("outside_calibrated", "share")
+
+    def _told(self, figure: str, name: str) -> float | None:
+        """A number of ``detail``; results from before there was such a figure do not have it."""
+        told = self.detail.get(figure)
+        value = told.get(name) if isinstance(told, dict) else None
+        return float(value) if isinstance(value, (int, float)) else None
+
 
 class RecomputationBatch(models.Model):
     """Many scans to be computed again with one recipe. How far it is stands in its orders, nowhere else."""

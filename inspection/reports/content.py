@@ -13,7 +13,7 @@ from typing import Any
 from django.conf import settings
 from django.utils import timezone
 
-from inspection.models import Calibration, Inspection, Limit, LimitSet, RangeImage, Recipe, Scan
+from inspection.models import Calibration, Inspection, Limit, LimitSet, PrecisionReport, RangeImage, Recipe, Scan
 from inspection.reports import picture
 from inspection.reports.chart import draw_trend
 from inspection.reports.figures import plain, with_uncertainty
@@ -180,6 +180,7 @@ def _precision(result: RangeImage) -> list[list[str]]:
         ["Saturated", f"{100 * precision.saturated_share:.4f} % ({precision.saturated_count})"],
         ["Noise σ, flat part", sigma],
         ["Range image", f"{result.rows} × {result.profiles}, {pitches}"],
+        *_trusted(precision),
         [
             "Processing",
             "not timed"
@@ -187,6 +188,16 @@ def _precision(result: RangeImage) -> list[list[str]]:
             else f"{precision.ns_per_range_pixel:.0f} ns per range pixel",
         ],
     ]
+
+
+def _trusted(precision: PrecisionReport) -> list[list[str]]:
+    """What is known of how sure the points are and how far the gauge reaches: nothing, in older results."""
+    rows = []
+    if (share := precision.confident_share) is not None:
+        rows.append([f"Confidence above {precision.confident_above}", f"{100 * share:.1f} % of measured points"])
+    if (share := precision.outside_calibrated_share) is not None:
+        rows.append(["Outside the calibrated range", f"{100 * share:.2f} % of heights"])
+    return rows
 
 
 def _charts(inspection: Inspection, limit_sets: Sequence[LimitSet], as_of: dt.datetime) -> list[Json]:

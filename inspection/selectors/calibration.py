@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from inspection.models import Calibration, Rig
+from scanning.calibration import DUE_DAYS
 from scanning.calibration import Calibration as Fit
 
 #: From so many days before its expiry a calibration is shown in yellow.
-SOON_DAYS: Final = 30
+SOON_DAYS: Final = DUE_DAYS
 
 
 def colour(calibration: Calibration | None, today: dt.date) -> str:

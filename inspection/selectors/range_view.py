@@ -24,19 +24,22 @@ from scanning.errors import BadInput
 from scanning.surface.plane import fit_plane
 
 Float32 = NDArray[np.float32]
-Channel = Literal["level", "height", "intensity", "width"]
+Channel = Literal["level", "height", "intensity", "width", "confidence"]
 CHANNELS: Final[dict[str, tuple[str, str]]] = {
     "level": ("Height above the plane", "um"),
     "height": ("Height as measured", "um"),
     "intensity": ("Brightness of the line", "grey"),
     "width": ("Width of the line", "px"),
+    "confidence": ("Confidence", "1"),
 }
 #: The count that means "not measured".
 NO_DATA: Final = -32768
 #: Smallest step sent, in the channel's unit; coarser only when the values would not fit 16 bits.
-FINEST: Final[dict[str, float]] = {"level": 0.1, "height": 0.1, "intensity": 0.1, "width": 0.01}
+FINEST: Final[dict[str, float]] = {"level": 0.1, "height": 0.1, "intensity": 0.1, "width": 0.01, "confidence": 0.001}
 #: A colour scale from this share of the values hides single wild pixels, not damage.
 STRETCH: Final = (0.5, 99.5)
+#: A share is always drawn from 0 to 1: stretched, a scan that is sure everywhere would look doubtful.
+FIXED_SPAN: Final[dict[str, tuple[float, float]]] = {"confidence": (0.0, 1.0)}
 
 
 @dataclass(frozen=True)
@@ -96,11 +99,14 @@ def _unreadable(file: str, error: Exception) -> BadInput:
 def _arrays(file: str, written_at: int) -> dict[str, Float32]:
     try:
         with np.load(file, allow_pickle=False) as stored:
-            return {
+            arrays = {
                 "height": stored["height_um"].astype(np.float32),
                 "intensity": stored["intensity"].astype(np.float32),
                 "width": stored["width_px"].astype(np.float32),
             }
+            if "confidence" in stored.files:
+                arrays["confidence"] = stored["confidence"].astype(np.float32)
+            return arrays
     except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
         raise _unreadable(file, error) from error
 
@@ -142,6 +148,13 @@ def _stored_plane(image: RangeImage) -> tuple[float, ...] | None:
         return None
 
 
+def channels_of(image: RangeImage) -> dict[str, tuple[str, str]]:
+    """The channels this image has, for a choice: results from before there was a confidence are without it."""
+    precision = getattr(image, "precision", None)
+    told = precision is not None and precision.confident_share is not None
+    return {key: words for key, words in CHANNELS.items() if key != "confidence" or told}
+
+
 def values(image: RangeImage, channel: str) -> Float32:
     """One channel in full, (rows, profiles), NaN = not measured. BadInput: no such channel, or a lost file."""
     if channel not in CHANNELS:
@@ -149,6 +162,8 @@ def values(image: RangeImage, channel: str) -> Float32:
     file = str(file_of(image))
     written_at = _written_at(file)
     arrays: dict[str, Float32] = _arrays(file, written_at)
+    if channel not in ("level", *arrays):
+        raise BadInput("This result does not say how sure its points are; compute the scan again to know it.")
     if channel != "level":
         measured: Float32 = arrays[channel]
         return (
@@ -197,7 +212,7 @@ def picture(data: Float32, image: RangeImage, channel: str, window: Window, most
         (profile + (step_profile - 1) / 2) * image.profile_pitch_um / 1e3,
     )
     unit = CHANNELS[channel][1] if channel in CHANNELS else "um"
-    return Picture(counts, scale, unit, origin_mm, cell_mm, (low, high))
+    return Picture(counts, scale, unit, origin_mm, cell_mm, FIXED_SPAN.get(channel, (low, high)))
 
 
 def whole(image: RangeImage) -> Window:

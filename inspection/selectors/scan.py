@@ -11,7 +11,7 @@ from django.utils import timezone
 
 from inspection.models import Damage, PrecisionReport, RangeImage, Recomputation, Scan
 from inspection.selectors.queue import expected_end, reason_for_waiting, seconds_per_step
-from inspection.selectors.range_view import damage_box
+from inspection.selectors.range_view import channels_of, damage_box
 from inspection.selectors.tool import Number, key_numbers, numbers
 from inspection.states import ScanState
 
@@ -101,6 +101,7 @@ class Result:
     numbers: list[Number]
     damages: list[DamageRow]
     precision: PrecisionReport | None
+    channels: dict[str, tuple[str, str]]
     newest: bool
 
     @property
@@ -151,7 +152,9 @@ def scan_state(scan: Scan, result_pk: int | None = None) -> ScanPage:
 
 def _result(pk: int, *, newest: bool) -> Result:
     image = (
-        RangeImage.objects.select_related("scan", "recipe", "calibration__by", "limit_set__tool_type", "baseline__scan")
+        RangeImage.objects.select_related(
+            "scan", "recipe", "calibration__by", "limit_set__tool_type", "baseline__scan", "precision"
+        )
         .prefetch_related("measurements", "damages", "limit_set__limits")
         .get(pk=pk)
     )
@@ -159,7 +162,8 @@ def _result(pk: int, *, newest: bool) -> Result:
         image=image,
         numbers=numbers(image),
         damages=[DamageRow(damage, damage_box(damage, image)) for damage in image.damages.all()],
-        precision=PrecisionReport.objects.filter(range_image=image).first(),
+        precision=getattr(image, "precision", None),
+        channels=channels_of(image),
         newest=newest,
     )
 

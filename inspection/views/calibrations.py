@@ -12,6 +12,7 @@ from inspection.models import Calibration, Rig
 from inspection.selectors.calibration import calibrations_by_rig, colour, fit_chart, stored_chart
 from inspection.services.calibrations import add_calibration, fit_pairs
 from inspection.views.signed_in import SignedIn, form_page, found, refused, said
+from scanning.calibration import standing
 from scanning.errors import Fault
 
 
@@ -29,6 +30,7 @@ def calibration_page(request: SignedIn, pk: int) -> HttpResponse:
         "calibration": calibration,
         "current": calibration.rig.calibration_now() == calibration,
         "colour": colour(calibration, today),
+        "standing": standing(calibration.valid_until, today)[1],
         "chart": stored_chart(calibration),
         "u_slope_percent": 100 * calibration.u_slope_mm_per_px / abs(calibration.slope_mm_per_px),
         "scans": calibration.scans.count(),

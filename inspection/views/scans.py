@@ -11,7 +11,7 @@ from django.views.decorators.http import require_POST, require_safe
 
 from inspection.models import Inspection, Measurement, RangeImage, Recipe, Scan, User
 from inspection.selectors.overview import worst
-from inspection.selectors.range_view import CHANNELS, check_same_pitch
+from inspection.selectors.range_view import check_same_pitch
 from inspection.selectors.scan import ScanPage, comparable, progress, progress_version, scan_state
 from inspection.selectors.tool import key_numbers, numbers
 from inspection.services import queue
@@ -48,7 +48,6 @@ def scan_page(request: SignedIn, pk: int) -> HttpResponse:
         "page": page,
         "result": page.result,
         "progress": progress(scan),
-        "channels": CHANNELS,
         "start_mm": scan.plan.get("start_mm", scan.region.start_mm),
         "fixed_um": _fixed_scale_um(page),
         "recipes": Recipe.objects.all() if scan.has_ended and scan.stack_file else [],

@@ -88,6 +88,11 @@ def test_a_range_image_is_drawn_cut_zoomed_and_turned(plant: dict[str, User], li
         assert page.evaluate("document.querySelector('[data-map]').data[0].type") == "surface"
         page.get_by_role("button", name="Map").click()
         page.locator("[data-map] .heatmaplayer image").wait_for()
+        page.locator("[data-channel]").select_option("confidence")
+        page.locator("#range[data-drawn=confidence]").wait_for()
+        page.locator("[data-map] .colorbar", has_text="confidence, 0 to 1").wait_for()
+        trace = "(t => [t.zmin, t.zmax])(document.querySelector('[data-map]').data[0])"
+        assert page.evaluate(trace) == [0, 1], "never stretched: a sure scan must look sure"
         assert who.complaints == []
 
 

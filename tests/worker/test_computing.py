@@ -83,6 +83,9 @@ def test_a_scan_ends_done_with_numbers_file_and_verdict(acquired: Scan) -> None:
     assert image.precision.sigma_um is not None
     assert image.precision.undefined_count == 0
     assert image.precision.cell_row_um == pytest.approx(7.150838, rel=1e-6)
+    with np.load(settings.RANGES / image.file) as arrays:
+        assert image.precision.confident_share == np.mean(arrays["confidence"] > 0.95)  # every pixel has a height
+        assert image.precision.outside_calibrated_share == arrays["outside_calibrated"].mean()
     measured = dict(image.measurements.values_list("metric", "value"))
     assert measured["n"] == 0
     assert measured["V-"] == 0

@@ -44,6 +44,11 @@ let solid = false;
 let point = null;
 let latest = 0;
 
+//: Channels from 0 to 1, and what stands at their colour bar and axis in place of a unit.
+const BAR = { confidence: "confidence, 0 to 1" };
+const barTitle = (unit) => (BAR[channel] ? { text: BAR[channel], side: "right" } : { text: unitWord(unit), side: "top" });
+const value = (name, unit) => `%{${name}:.${BAR[channel] ? 2 : 1}f} ${BAR[channel] ? "" : unitWord(unit)}`;
+
 const address = (most, window) => {
   const query = new URLSearchParams({ channel, max: most, result: panel.dataset.result });
   if (window) {
@@ -104,8 +109,8 @@ async function draw() {
   try {
     const picture = await fetchPicture(address(solid ? CELLS_3D : CELLS));
     if (mine !== latest) return;
-    const unit = unitWord(picture.unit);
-    const bar = { title: { text: unit, side: "top" }, thickness: 14, outlinewidth: 0 };
+    const title = barTitle(picture.unit);
+    const bar = { title, thickness: 14, outlinewidth: 0 };
     const colorscale = channel === "level" || channel === "height" ? "Viridis" : "Cividis";
     const common = { ...laid(picture), colorscale, colorbar: bar };
     const { zmin, zmax } = scaleOf(picture);
@@ -118,11 +123,11 @@ async function draw() {
       await Plotly.newPlot(map, [{
         type: "surface", z: picture.z.map((row) => Array.from(row)), x: axis(0, picture.columns, picture.dx, picture.x0 + startMm),
         y: axis(1, picture.rows, picture.dy, picture.y0), colorscale, cmin: zmin, cmax: zmax, colorbar: bar,
-        hovertemplate: `%{x:.3f} mm, %{y:.3f} mm<br>%{z:.1f} ${unit}<extra></extra>`,
+        hovertemplate: `%{x:.3f} mm, %{y:.3f} mm<br>${value("z", picture.unit)}<extra></extra>`,
       }], look({
         margin: { l: 0, r: 0, t: 0, b: 0 },
         scene: {
-          xaxis: { title: { text: "along, mm" } }, yaxis: { title: { text: "across, mm" }, autorange: "reversed" }, zaxis: { title: { text: unit } },
+          xaxis: { title: { text: "along, mm" } }, yaxis: { title: { text: "across, mm" }, autorange: "reversed" }, zaxis: { title: { text: title.text } },
           aspectmode: "manual", aspectratio: aspect(picture), camera: { eye: { x: 0.9, y: -1.3, z: 0.9 } },
         },
       }), config);
@@ -130,7 +135,7 @@ async function draw() {
     }
     await Plotly.newPlot(map, [{
       type: "heatmap", ...common, zmin, zmax, zsmooth: false, hoverongaps: false,
-      hovertemplate: `${flat.title.split(" ")[0]} %{x:.3f} mm<br>${upright.title.split(" ")[0]} %{y:.3f} mm<br><b>%{z:.1f} ${unit}</b><extra></extra>`,
+      hovertemplate: `${flat.title.split(" ")[0]} %{x:.3f} mm<br>${upright.title.split(" ")[0]} %{y:.3f} mm<br><b>${value("z", picture.unit)}</b><extra></extra>`,
     }], layout(), config);
     map.removeAllListeners?.("plotly_relayout");
     map.on("plotly_relayout", zoomed);
@@ -206,15 +211,19 @@ async function clicked(event) {
 function profileChart(element, line, axis, here, unit) {
   const trace = {
     type: "scatter", mode: "lines", y: line.values, x0: axis.start, dx: line.step_mm, line: { color: colour("--accent"), width: 1.5 },
-    connectgaps: false, hovertemplate: `%{x:.3f} mm: %{y:.1f} ${unitWord(unit)}<extra></extra>`,
+    connectgaps: false, hovertemplate: `%{x:.3f} mm: ${value("y", unit)}<extra></extra>`,
   };
   const mark = { type: "line", x0: here, x1: here, yref: "paper", y0: 0, y1: 1, line: { color: colour("--ink"), width: 1, dash: "dot" } };
   Plotly.react(element, [trace], look({
-    shapes: [mark], margin: { l: 52, r: 8, t: 6, b: 42 }, xaxis: { title: { text: axis.title } }, yaxis: { title: { text: unitWord(unit) } },
+    shapes: [mark], margin: { l: 52, r: 8, t: 6, b: 42 }, xaxis: { title: { text: axis.title } }, yaxis: { title: { text: barTitle(unit).text }, ...(BAR[channel] && { range: [0, 1.05] }) },
   }), config);
 }
 
-panel.querySelector("[data-channel]").addEventListener("change", (event) => { channel = event.target.value; draw(); });
+panel.querySelector("[data-channel]").addEventListener("change", (event) => {
+  channel = event.target.value;
+  panel.querySelector("[data-stretch]").disabled = channel !== "level";  // only the level has a fixed scale to choose
+  draw();
+});
 panel.querySelector("[data-stretch]").addEventListener("change", () => draw());
 panel.querySelector("[data-reset]").addEventListener("click", () => { point = null; if (solid) toggle(); else draw(); });
 const button = panel.querySelector("[data-3d]");

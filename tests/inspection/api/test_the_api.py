@@ -210,6 +210,12 @@ def test_a_scan_comes_with_numbers_damages_precision_and_provenance(reader):
     assert numbers["Sq_c"]["value"] is None
     assert [damage["severity"] for damage in result["damages"]] == ["medium", "medium", "minor"]
     assert result["precision"]["sigma_um"] == 4.21
+    assert result["precision"]["confident_share"] is None  # stored before there was such a figure
+    known = {"confident": {"above": 0.95, "share": 0.972}, "outside_calibrated": {"count": 0, "share": 0.0}}
+    plant.result(scan, 1, 5.0, {}, False, (4, 4), scan.limit_set, later=dt.timedelta(hours=2), precision=known)
+    newest = strict(reader.get(f"/scans/{scan.pk}"))["result"]["precision"]
+    assert (newest["confident_share"], newest["confident_above"]) == (0.972, 0.95)
+    assert newest["outside_calibrated_share"] == 0.0
     assert result["calibration"]["slope_mm_per_px"] == 0.014237376
     assert result["limits_version"] == 1
     assert len(told["results"]) == 2

@@ -168,6 +168,7 @@ def result(
     shape: tuple[int, int],
     limits: LimitSet,
     later: dt.timedelta = dt.timedelta(0),
+    precision: dict[str, Any] | None = None,
 ) -> RangeImage:
     verdict, reasons = [
         (Verdict.OK, ["All metrics are below their limits."]),
@@ -243,6 +244,7 @@ def result(
     PrecisionReport.objects.create(
         range_image=image, undefined_count=15300, undefined_share=0.0635, saturated_count=120, saturated_share=2.1e-6,
         sigma_um=4.21, cell_scan_um=41.65, cell_row_um=7.15, ns_per_range_pixel=812.0, cpu_ns_per_range_pixel=1490.0,
+        detail=precision or {},
     )  # fmt: skip
     return image
 

@@ -51,6 +51,16 @@ def test_it_says_the_verdict_and_what_it_rests_on(last):
     assert scan.range_images.get().sha256 in text.replace("\u200b", "").replace(" ", "")
 
 
+def test_it_says_how_sure_the_points_are_where_that_is_known(last):
+    assert "Confidence" not in words(inspection_pdf(last))
+    scan = last.scans.get(region__name="R2")
+    told = {"confident": {"above": 0.95, "share": 0.9721}, "outside_calibrated": {"count": 9, "share": 0.0004}}
+    plant.result(scan, 1, 5.0, {}, False, SMALL, scan.limit_set, later=dt.timedelta(hours=1), precision=told)
+    text = words(inspection_pdf(Inspection.objects.get(pk=last.pk)))
+    assert text.count("Confidence above 0.95 97.2 % of measured points") == 1
+    assert text.count("Outside the calibrated range 0.04 % of heights") == 1
+
+
 def test_the_same_records_give_the_same_bytes(last):
     assert inspection_pdf(last) == inspection_pdf(Inspection.objects.get(pk=last.pk))
 

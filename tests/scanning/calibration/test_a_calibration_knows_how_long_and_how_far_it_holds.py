@@ -32,7 +32,7 @@ def test_the_covariance_gives_the_uncertainty_of_any_height() -> None:
         ("2026-11-24", "valid", "valid until 2027-05-24"),
         ("2027-04-24", "due", "in 30 days"),
         ("2027-05-24", "due", "in 0 days"),
-        ("2027-05-25", "expired", "expired on 2027-05-24, 1 days ago"),
+        ("2027-05-25", "expired", "expired on 2027-05-24, 1 day ago"),
     ],
 )
 def test_expiry_is_told_by_the_day(on: str, state: str, said: str) -> None:
@@ -92,7 +92,7 @@ def test_every_height_outside_the_gauge_is_flagged_in_the_image_and_its_file(tmp
     again = RangeImage.load(tmp_path / "range.npz").outside_calibrated
     assert again is not None
     assert again.tolist() == expected
-    assert precision_of(image).to_json()["outside_calibrated"] == {"count": 2}
+    assert precision_of(image).to_json()["outside_calibrated"] == {"count": 2, "share": 0.4}
 
 
 def test_heights_without_a_gauge_have_no_range(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -126,6 +127,21 @@ def test_cost_and_counts_come_from_the_image() -> None:
     assert (report.saturated, report.saturated_share) == (30, 0.01)
     assert report.ns_per_range_pixel == pytest.approx(0.5e9 / 5000)
     assert report.cpu_ns_per_range_pixel == pytest.approx(0.25e9 / 5000)
+
+
+def test_the_share_of_sure_points_counts_measured_points_only() -> None:
+    height = _tilted(10, 10)
+    height[0] = np.nan
+    confidence = np.full(height.shape, 0.99, np.float32)
+    confidence[1, :9] = 0.95  # not above 0.95
+    confidence[2, :9] = np.nan  # measured, but nothing says how sure it is
+    image = replace(_image(height), confidence=confidence)
+    assert precision_of(image).to_json()["confident"] == {"above": 0.95, "share": pytest.approx(72 / 90)}
+
+
+@pytest.mark.parametrize("confidence", [None, np.full((10, 10), np.nan, np.float32)], ids=["no channel", "never told"])
+def test_an_image_that_does_not_say_how_sure_it_is_has_no_such_share(confidence: NDArray[Any] | None) -> None:
+    assert precision_of(replace(_image(_tilted(10, 10)), confidence=confidence)).to_json()["confident"] is None
 
 
 def test_a_given_flat_part_is_used() -> None:
