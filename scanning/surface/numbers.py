@@ -78,8 +78,8 @@ def damage_numbers(
             deepest.depth_um if deepest else 0.0,
             "um",
             deepest.u_depth_um if deepest else u_zero,
-            f"Deepest point inside the damage masks: of the residual smoothed with {settings.small_scale_um:g} um, freed "
-            "of noise, plus what smoothing filled in"
+            f"Deepest point inside the damage masks: of the residual smoothed with {settings.small_scale_um:g} um, "
+            "freed of noise, plus what smoothing filled in"
             + (f", damage {deepest.number}; " if deepest else "; no damage found; ")
             + f"{figures.sentence}.",
         ),
